@@ -1,0 +1,32 @@
+"""What a run is worth: synergy diagnostics, pictures, and statistics of evaluations."""
+
+from torchrl_etl.analysis.diagnostics import (
+    MixtureUsage,
+    control_authority,
+    mixture_usage,
+    nmf_vaf,
+    pca_vaf,
+    synergy_effects,
+    synergy_warnings,
+    variance_accounted_for,
+)
+from torchrl_etl.analysis.pictures import embedding, learning_curves, synergy_heatmap, vaf_curve
+from torchrl_etl.analysis.statistics import Interval, interval, success_interval
+
+__all__ = [
+    "Interval",
+    "MixtureUsage",
+    "control_authority",
+    "embedding",
+    "interval",
+    "learning_curves",
+    "mixture_usage",
+    "nmf_vaf",
+    "pca_vaf",
+    "success_interval",
+    "synergy_effects",
+    "synergy_heatmap",
+    "synergy_warnings",
+    "vaf_curve",
+    "variance_accounted_for",
+]

@@ -1,0 +1,29 @@
+"""Environments: named tasks, one factory, and a small analytic system."""
+
+import gymnasium
+
+from torchrl_etl.envs.analytic import AnalyticOveractuated
+from torchrl_etl.envs.factory import actuator_names, make_env
+from torchrl_etl.envs.simulator import mujoco_state
+from torchrl_etl.envs.tasks import Task, episode_length, list_tasks, resolve_task
+from torchrl_etl.envs.wrappers import SimulationError
+
+__all__ = [
+    "AnalyticOveractuated",
+    "SimulationError",
+    "Task",
+    "actuator_names",
+    "episode_length",
+    "list_tasks",
+    "make_env",
+    "mujoco_state",
+    "resolve_task",
+]
+
+for _id, _goal in (("Overactuated-v0", "fixed"), ("OveractuatedRandom-v0", "random")):
+    gymnasium.register(
+        f"torchrl_etl/{_id}",
+        entry_point="torchrl_etl.envs.analytic:AnalyticOveractuated",
+        max_episode_steps=25,
+        kwargs={"goal": _goal},
+    )

@@ -1,0 +1,17 @@
+"""Networks as TensorDict modules."""
+
+from torchrl_etl.modules.actor_critic import make_actor, make_critic
+from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder, Posterior
+from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
+from torchrl_etl.modules.synergy_decoder import SynergyDecoder
+
+__all__ = [
+    "GMVAE",
+    "ActionDecoder",
+    "GaussianDynamics",
+    "Posterior",
+    "StateEncoder",
+    "SynergyDecoder",
+    "make_actor",
+    "make_critic",
+]

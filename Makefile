@@ -1,0 +1,38 @@
+# make demo: both stages of ETL on a MyoSuite hand, in a few minutes.
+# make test: the whole test suite, in the same environment.
+
+PYTHON ?= python3
+# Everything is run from inside the repository, so a path with a space in it is fine.
+VENV := .venv
+BIN := $(VENV)/bin
+# Headless everywhere; one OpenMP thread per process keeps two cores for two processes.
+export MPLBACKEND := Agg
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: demo test lint lock clean
+
+demo: $(VENV)/.complete
+	$(BIN)/python recipes/etl_sac.py env=myoHandPenTwirl experiment=demo
+
+test: $(VENV)/.complete lint
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+lint: $(VENV)/.complete
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# The marker is written last: an installation that broke off is done again.
+$(VENV)/.complete: requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	touch $@
+
+# Pin what is installed now.
+lock:
+	$(BIN)/python -m pip freeze --exclude-editable --all | grep -v '^pip==' | sed 's/+cpu//' > requirements.lock
+
+clean:
+	rm -rf $(VENV)

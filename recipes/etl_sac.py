@@ -1,0 +1,67 @@
+"""Explore to Learn with SAC: find synergies, then learn the task in them.
+
+python recipes/etl_sac.py env=myoHandPenTwirl experiment=quick
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl
+from torchrl_etl.envs import SimulationError
+from torchrl_etl.training import Experiment, Interrupted, resumed_config
+
+CONF = Path(__file__).parent / "conf"
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+def main(config: DictConfig) -> None:
+    quiet_torchrl()
+    with one_sentence(ValueError, OSError):
+        resume = None
+        if config.resume is not None:
+            resume = Path(config.resume)
+            config = resumed_config(resume, list(HydraConfig.get().overrides.task))
+        experiment = Experiment(config, resume=resume, say=print)
+    folder = experiment.folder.path
+    print(f"Run folder: {folder}")
+    try:
+        with one_sentence(OSError, SimulationError):
+            summary = experiment.run()
+    except Interrupted:
+        print(f"Stopped and saved. To go on: python {sys.argv[0]} resume='{folder}'")
+        sys.exit(130)
+    print(report(summary, folder))
+
+
+def report(summary: dict[str, Any], folder: Path) -> str:
+    """What a person wants to know at the end of a run."""
+    synergies, learned = summary["synergies"], summary.get("learn", {})
+    lines = [
+        "",
+        f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}",
+        f"  synergies  variance accounted for {synergies['vaf']:.3f} (PCA "
+        f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
+        f"control authority {synergies['control_authority']:.2f}",
+    ]
+    for key in ("return", "solved"):
+        if key in learned:
+            value = learned[key]
+            lines.append(
+                f"  {key:<9}  {value['before']:.2f} before, {value['after']:.2f} after "
+                f"(95% interval {value['low']:.2f} to {value['high']:.2f}, "
+                f"{learned['frames_charged']:,} frames)"
+            )
+    lines += [f"  pictures   {folder / 'pictures'}", f"  all of it  {folder}"]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    check_overrides(CONF / "config.yaml", sys.argv[1:])
+    main()

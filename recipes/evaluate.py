@@ -1,0 +1,53 @@
+"""Evaluate a run of etl_sac.py on fixed seeds: return and solved, with intervals.
+
+python recipes/evaluate.py run=runs/... episodes=50 video=true
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl
+from torchrl_etl.training import Experiment, record_episodes, resumed_config
+
+CONF = Path(__file__).parent / "conf"
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    quiet_torchrl()
+    with one_sentence(ValueError, OSError):
+        run = Path(config.run)
+        trained = resumed_config(
+            run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]
+        )
+        experiment = Experiment(trained, resume=run)
+        stage = experiment.learned()
+    evaluation = experiment.evaluator(stage)()
+    result = {"env": trained.env, "goal": trained.goal, **evaluation.summary()}
+    path = experiment.folder.write_json("evaluation.json", result)
+    print(f"{trained.env} ({trained.goal} goal), {config.episodes} episodes, deterministic policy")
+    for key in ("return", "solved"):
+        if key in result:
+            mean, low, high = result[key].values()
+            print(f"  {key:<7} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+    print(f"  written to {path}")
+    if config.video:
+        with one_sentence(RuntimeError):
+            videos = record_episodes(
+                experiment.evaluation_env(stage),
+                stage.policy,
+                experiment.folder.path / "videos",
+                episodes=config.video_episodes,
+                size=tuple(config.video_size),
+            )
+        print("  videos  " + ", ".join(str(video) for video in videos))
+
+
+if __name__ == "__main__":
+    check_overrides(CONF / "evaluate.yaml", sys.argv[1:])
+    main()

@@ -1,0 +1,33 @@
+"""Small configurations for tests of the training loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+ROOT = Path(__file__).parent.parent
+CONF = ROOT / "recipes" / "conf"
+
+# Small nets on the analytic environment: a stage takes a second or two.
+TINY = (
+    "env=overactuated",
+    "experiment=smoke",
+    "num_synergies=2",
+    "network.hidden=[32,32]",
+    "explore.encoder.hidden=[32,32]",
+    "explore.gmvae.hidden=[32,32]",
+    "explore.batch_size=32",
+    "learn.batch_size=32",
+    "explore.fit.final_updates=20",
+    "progress=false",
+    "pictures=false",
+    "threads=1",
+)
+
+
+def tiny(*overrides: str, name: str = "config") -> DictConfig:
+    """The tiny configuration with overrides."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, overrides=[*TINY, *overrides])

@@ -1,0 +1,219 @@
+"""The synergy bundle survives the disk bit for bit, or says in one sentence why not."""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.bundle import (
+    BundleError,
+    BundleInfo,
+    check_compatible,
+    load_bundle,
+    save_bundle,
+)
+
+NAMES = ("biceps", "triceps", "deltoid", "soleus", "psoas")
+
+
+def fitted_decoder(seed=0, **kwargs):
+    torch.manual_seed(seed)
+    low, high = [0.0, -1.0, 0.0, 0.1, 0.0], [1.0, 1.0, 2.0, 0.7, 1.0]
+    gmvae = GMVAE(5, 2, num_components=3, low=low, high=high, hidden=(8, 16))
+    return SynergyDecoder.from_gmvae(gmvae, torch.rand(64, 5), **kwargs)
+
+
+def save(decoder, path, **facts):
+    return save_bundle(decoder, path, task="toy", actuators=NAMES, facts=facts)
+
+
+def edit(folder, **changes):
+    """Change entries of the description; None removes one."""
+    file = folder / "synergies.json"
+    content = json.loads(file.read_text()) | changes
+    dropped = {key for key, value in changes.items() if value is None}
+    file.write_text(json.dumps({k: v for k, v in content.items() if k not in dropped}))
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return save(fitted_decoder(), tmp_path / "run" / "synergies")
+
+
+def same_weights(decoder, other):
+    ours, theirs = decoder.state_dict(), other.state_dict()
+    return ours.keys() == theirs.keys() and all(torch.equal(ours[k], theirs[k]) for k in ours)
+
+
+@pytest.mark.parametrize("residual", [0.0, 0.25])
+def test_round_trip_is_bit_equal(tmp_path, residual):
+    decoder = fitted_decoder(residual=residual)
+    facts = {
+        "frames": np.int64(1000),
+        "vaf": torch.tensor(0.5),
+        "worst": float("nan"),
+        "versions": {"torch": "2"},
+    }
+    folder = save_bundle(
+        decoder, tmp_path / "b", task="toy", actuators=NAMES, facts=facts, num_components=3
+    )
+    loaded, info = load_bundle(folder)
+    assert same_weights(decoder, loaded)
+    synergy = torch.rand(7, decoder.synergy_dim) * 2 - 1
+    assert torch.equal(loaded(synergy), decoder(synergy))
+    assert (info.task, info.actuators, info.residual) == ("toy", NAMES, residual)
+    assert (info.num_synergies, info.num_components) == (2, 3)
+    assert info.low == tuple(decoder.low.tolist()) and info.high == tuple(decoder.high.tolist())
+    assert info.facts == {"frames": 1000, "vaf": 0.5, "worst": None, "versions": {"torch": "2"}}
+    assert sorted(os.listdir(folder)) == ["synergies.json", "synergies.safetensors"]
+
+
+def test_loads_from_the_run_folder_with_other_keys_and_residual(bundle):
+    decoder, info = load_bundle(
+        bundle.parent, residual=0.5, in_keys=[("arm", "synergy")], out_keys=[("arm", "action")]
+    )
+    data = decoder(TensorDict({"arm": {"synergy": torch.zeros(3, 7)}}, [3]))
+    assert data["arm", "action"].shape == (3, 5)
+    assert info.residual == 0.0
+
+
+def test_loading_leaves_the_global_seed_alone(bundle):
+    state = torch.get_rng_state()
+    load_bundle(bundle)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def flip_a_byte(folder):
+    file = folder / "synergies.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-3] ^= 1
+    file.write_bytes(content)
+
+
+def widen(folder):
+    config = json.loads((folder / "synergies.json").read_text())["config"]
+    edit(folder, config=config | {"hidden": [9, 9]})
+
+
+DAMAGE = {
+    "SHA-256": flip_a_byte,
+    "safetensors in .* cannot be read": lambda f: (f / "synergies.safetensors").unlink(),
+    "json in .* cannot be read": lambda f: (f / "synergies.json").unlink(),
+    "is not JSON": lambda f: (f / "synergies.json").write_text("{"),
+    "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("[1]"),
+    "format version 2 and this torchrl_etl reads 1": lambda f: edit(f, format_version=2),
+    r"lacks \['task'\]": lambda f: edit(f, task=None),
+    r"the unknown \['surprise'\]": lambda f: edit(f, surprise=1),
+    "'x' as low where a JSON array belongs": lambda f: edit(f, low="x"),
+    "do not make a SynergyDecoder": widen,
+    "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
+    "states 1 actuators": lambda f: edit(f, actuators=["biceps"]),
+    "There is no synergy bundle": shutil.rmtree,
+}
+
+
+@pytest.mark.parametrize("words", DAMAGE)
+def test_damage_is_named(bundle, words):
+    DAMAGE[words](bundle)
+    with pytest.raises(BundleError, match=words):
+        load_bundle(bundle)
+
+
+def test_a_pickle_in_disguise_is_refused_without_running(bundle, tmp_path):
+    trap = tmp_path / "ran"
+
+    class Payload:
+        def __reduce__(self):
+            return (open, (str(trap), "w"))
+
+    for content in (pickle.dumps(Payload()), b"\x80\x02" + b"\x00" * 64):
+        (bundle / "synergies.safetensors").write_bytes(content)
+        edit(bundle, sha256=hashlib.sha256(content).hexdigest())
+        with pytest.raises(BundleError, match="not a safetensors file"):
+            load_bundle(bundle)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("survives", [0, 1])
+@pytest.mark.parametrize("killed", [False, True], ids=["error", "killed"])
+def test_a_save_cut_short_leaves_the_old_bundle(bundle, monkeypatch, survives, killed):
+    """``survives`` moves succeed, then one fails; when killed, nothing after it runs either."""
+    old, new = load_bundle(bundle)[0], fitted_decoder(seed=1)
+    calls, replace = [], os.replace
+
+    def failing(source, target):
+        calls.append(source)
+        if len(calls) == survives + 1 or (killed and len(calls) > survives):
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", failing)
+        if killed:
+            patch.setattr(shutil, "rmtree", lambda *args, **kwargs: None)
+        with pytest.raises(KeyboardInterrupt):
+            save(new, bundle)
+    assert same_weights(load_bundle(bundle)[0], old)
+    assert same_weights(load_bundle(bundle.parent)[0], old)
+    save(new, bundle)
+    assert same_weights(load_bundle(bundle)[0], new)
+    assert os.listdir(bundle.parent) == ["synergies"]
+
+
+def test_saving_refuses_to_sweep_away_other_files(bundle):
+    run = bundle.parent
+    with pytest.raises(BundleError, match="holds 'synergies', and saving a bundle there would"):
+        save(fitted_decoder(), run)
+    (run / "file").touch()
+    with pytest.raises(BundleError, match="is a file"):
+        save(fitted_decoder(), run / "file")
+    assert load_bundle(run)
+
+
+def test_saving_refuses_wrong_names_and_facts_that_json_cannot_hold(tmp_path):
+    decoder = fitted_decoder()
+    for names in (NAMES[:4], NAMES[:4] + NAMES[:1]):
+        with pytest.raises(BundleError, match="decoder for 5 actuators"):
+            save_bundle(decoder, tmp_path / "b", task="toy", actuators=names)
+    with pytest.raises(BundleError, match=r"facts\['a'\]\[1\] is a object"):
+        save(decoder, tmp_path / "b", a=[1, object()])
+    assert not list(tmp_path.iterdir())
+
+
+def info(names=NAMES, low=0.0, high=1.0):
+    n = len(names)
+    return BundleInfo("toy", tuple(names), (low,) * n, (high,) * n, 2, 0.0, {}, "")
+
+
+def test_the_same_muscles_and_bounds_are_compatible():
+    check_compatible(info(), NAMES, 0.0, 1.0)
+    check_compatible(info(low=0.1), list(NAMES), torch.full((5,), 0.1), [1.0] * 5)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (NAMES[::-1], "another order .number 0 is 'biceps' in the bundle, 'psoas' in the env"),
+        ([*NAMES, "gracilis"], "5 actuators and the environment has 6, .*a part of this body"),
+        (NAMES[:3], "also moves 'soleus', 'psoas'.* on a larger body"),
+        ([f"finger{i}" for i in range(39)], "has 39, with no name in common"),
+        ([*NAMES[:4], "psoas_r"], "perhaps renamed: 'psoas' for 'psoas_r'"),
+    ],
+)
+def test_other_muscles_are_refused_with_the_likeliest_reason(names, words):
+    with pytest.raises(BundleError, match=words):
+        check_compatible(info(), names, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(("low", "high", "side"), [(-1.0, 1.0, "lower"), (0.0, 2.0, "upper")])
+def test_other_bounds_are_refused(low, high, side):
+    words = f"other {side} action bounds .* 5 of 5 actuators .'biceps'"
+    with pytest.raises(BundleError, match=words):
+        check_compatible(info(), NAMES, low, high)

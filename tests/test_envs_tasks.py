@@ -1,0 +1,102 @@
+"""Names: what resolves to what, and what a wrong one is told."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import pytest
+
+from torchrl_etl.envs import episode_length, list_tasks, resolve_task
+
+PAPER = {
+    "myoHandPose": "myoHandPoseFixed-v0",
+    "myoHandKeyTurn": "myoHandKeyTurnFixed-v0",
+    "myoHandPenTwirl": "myoHandPenTwirlFixed-v0",
+    "myoBaoding": "myoChallengeBaodingP1-v1",
+    "myoDieReorient": "myoChallengeDieReorientP1-v0",
+    "myoRelocate": "myoChallengeRelocateP1-v0",
+    "myoLegWalk": "myoLegWalk-v0",
+    "myoLegStairTerrainWalk": "myoLegStairTerrainWalk-v0",
+    "humanoid-stand": "humanoid-stand",
+    "humanoid-walk": "humanoid-walk",
+    "humanoid-run": "humanoid-run",
+    "dog-walk": "dog-walk",
+    "dog-run": "dog-run",
+}
+
+
+def test_the_papers_thirteen_resolve():
+    assert {task.name: resolve_task(task.name).env_id for task in list_tasks()} == PAPER
+
+
+def test_ids_and_lengths_are_those_of_the_suites():
+    import myosuite  # noqa: F401
+    from dm_control import suite
+
+    for task in list_tasks():
+        if task.suite == "dm_control":
+            assert tuple(task.id.split("-")) in suite.ALL_TASKS
+        else:
+            for env_id in filter(None, (task.id, task.random_id)):
+                assert gym.spec(env_id).max_episode_steps == task.episode_steps
+
+
+@pytest.mark.parametrize("name", ["myoHandPose", "myoHandKeyTurn", "myoHandPenTwirl"])
+def test_random_goal_picks_the_random_id(name):
+    assert resolve_task(name, "random").env_id == f"{name}Random-v0"
+    assert resolve_task(f"{name}Random-v0") == resolve_task(name, "random")
+
+
+def test_random_goal_of_a_task_without_one_names_those_that_have_it():
+    with pytest.raises(ValueError, match=r"dog-run has no random goal.*myoHandKeyTurn"):
+        resolve_task("dog-run", "random")
+    with pytest.raises(ValueError, match="Pendulum-v1 has no random goal"):
+        resolve_task("Pendulum-v1", "random")
+
+
+def test_goal_that_contradicts_the_id_is_refused():
+    with pytest.raises(ValueError, match="leave goal out, or name the task 'myoHandPose'"):
+        resolve_task("myoHandPoseRandom-v0", "fixed")
+
+
+def test_unknown_goal_is_refused():
+    with pytest.raises(ValueError, match="'fixed' or 'random', got 'moving'"):
+        resolve_task("myoHandPose", "moving")
+
+
+@pytest.mark.parametrize(
+    "wrong, right",
+    [
+        ("myoHandPenTwril", "myoHandPenTwirl"),
+        ("MYOBAODING", "myoBaoding"),
+        ("humanoid-stnad", "humanoid-stand"),
+        ("cheetah-rnu", "cheetah-run"),
+        ("Pendulm-v1", "Pendulum-v1"),
+        ("myoHandPoseRandom-v1", "myoHandPoseRandom-v0"),
+    ],
+)
+def test_wrong_name_is_told_the_nearest_right_one(wrong, right):
+    with pytest.raises(ValueError, match=f"Unknown task '{wrong}'; .* {right}[,.;]"):
+        resolve_task(wrong)
+
+
+def test_other_suites_are_accepted_by_name():
+    assert resolve_task("cheetah-run").suite == "dm_control"
+    assert resolve_task("Pendulum-v1").episode_steps == 200
+    assert resolve_task("myoElbowPose1D6MRandom-v0").episode_steps == 100
+
+
+def test_episode_length():
+    assert episode_length("myoHandPenTwirl") == 50
+    assert episode_length("cheetah-run") == 1000
+    assert episode_length("myoHandKeyTurn", "random") == 200
+
+
+@pytest.mark.slow
+def test_paper_names_resolve_without_importing_a_simulator():
+    code = (
+        "import sys; from torchrl_etl.envs import list_tasks, resolve_task\n"
+        "[resolve_task(t.name) for t in list_tasks()]\n"
+        "sys.exit(any(m in sys.modules for m in ('myosuite', 'dm_control')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

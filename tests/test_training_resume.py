@@ -1,0 +1,160 @@
+"""A run that was killed goes on, and ends with the numbers of one that was not."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.configs import ROOT, TINY, tiny
+from torchrl_etl.training import Experiment, Interrupted, resumed_config
+
+WALL_CLOCK = "frames_per_second"
+
+
+def numbers(run: Path) -> dict[str, str]:
+    """Everything a run logged and concluded, but for the time it took."""
+    scalars = {
+        path.relative_to(run).as_posix(): path.read_text()
+        for path in sorted((run / "csv").rglob("*.csv"))
+        if path.stem != WALL_CLOCK
+    }
+    summary = json.loads((run / "summary.json").read_text())
+    for section in (summary, summary["synergies"]):
+        for key in ("versions", "commit"):
+            section.pop(key, None)
+    return {**scalars, "summary": json.dumps(summary)}
+
+
+def command(run: Path, *overrides: str) -> list[str]:
+    recipe = [sys.executable, str(ROOT / "recipes" / "etl_sac.py")]
+    return [*recipe, *TINY, f"run_dir='{run}'", *overrides]
+
+
+def start(arguments: list[str], log: Path) -> subprocess.Popen:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with log.open("w") as file:
+        return subprocess.Popen(
+            arguments, stdout=file, stderr=subprocess.STDOUT, cwd=log.parent, env=environment
+        )
+
+
+def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline, f"{path} did not appear"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory) -> dict[str, str]:
+    run = tmp_path_factory.mktemp("whole") / "run"
+    Experiment(tiny(f"run_dir='{run}'")).run()
+    return numbers(run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["explore", "learn"])
+def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(stage, tmp_path, uninterrupted):
+    run = tmp_path / "a run"  # with a space
+    process = start(command(run), tmp_path / "log.txt")
+    wait_for(run / "checkpoints" / stage / "checkpoint-000000000320" / "seal.json", process)
+    time.sleep(random.uniform(0, 0.3))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (run / "summary.json").exists()
+
+    Experiment(resumed_config(run), resume=run).run()
+    assert numbers(run) == uninterrupted
+
+
+def test_killed_before_the_first_checkpoint_starts_that_stage_over(tmp_path, uninterrupted):
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    experiment.folder.open(resume=False)
+    experiment.folder.log({"explore/return": 1.0, "learn/eval/return": 2.0}, 0)
+    Experiment(resumed_config(run), resume=run).run()
+    assert numbers(run) == uninterrupted
+
+
+def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'", "seed=1")).run()
+    other = numbers(run)
+    assert other.keys() == uninterrupted.keys()
+    assert other["csv/scalars/learn/return.csv"] != uninterrupted["csv/scalars/learn/return.csv"]
+
+
+def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrupted):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'")).run()
+    newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
+    victim = next(path for path in newest.rglob("*.memmap") if path.stat().st_size)
+    content = bytearray(victim.read_bytes())
+    content[0] ^= 1
+    victim.write_bytes(content)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Experiment(resumed_config(run), resume=run).run()
+    assert any(f"{newest} is damaged" in str(warning.message) for warning in caught)
+    assert numbers(run) == uninterrupted
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    stage = experiment.explore_stage()
+    monkeypatch.setattr(experiment, "explore_stage", lambda: stage)
+    update = stage.update
+
+    def update_and_signal():
+        if stage.progress.frames == 224:
+            os.kill(os.getpid(), number)
+        return update()
+
+    monkeypatch.setattr(stage, "update", update_and_signal)
+    with pytest.raises(Interrupted):
+        experiment.run()
+    assert (run / "checkpoints/explore/checkpoint-000000000224/seal.json").exists()
+    summary = Experiment(resumed_config(run), resume=run).run()
+    assert summary["learn"]["frames"] == 608
+    frames, _ = experiment.folder.series("explore/updates")
+    assert frames == sorted(set(frames)), "no frame is logged twice"
+
+
+def test_a_longer_budget_can_be_given_when_resuming(tmp_path):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'", "learn.frames=320")).run()
+    longer = resumed_config(run, ["learn.frames=640", f"resume={run}"])
+    summary = Experiment(longer, resume=run).run()
+    assert summary["learn"]["frames"] == 640
+
+
+def test_learner_state_is_bit_exact_after_a_load(tmp_path):
+    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'"))
+    stage = experiment.explore_stage()
+    stage.restart_collection()
+    for _ in range(4):
+        stage.collect()
+        stage.update()
+    stage.checkpoint().save(tmp_path / "saved")
+    twin = experiment.explore_stage()
+    twin.checkpoint().load(tmp_path / "saved")
+    rows = []
+    for one in (stage, twin):
+        torch.manual_seed(0)
+        rows.append(torch.stack([one.update() for _ in range(3)]))
+    assert (rows[0] == rows[1]).all()
+    stage.close()

@@ -1,0 +1,184 @@
+"""Order, freshness, and who learns what in the two stages."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from tests.configs import tiny
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.training import Experiment
+
+
+def explore_stage(*overrides):
+    stage = Experiment(tiny("run_dir=unused", *overrides)).explore_stage()
+    stage.restart_collection()
+    return stage
+
+
+def learn_stage(decoder=None, *overrides):
+    decoder = decoder or SynergyDecoder(2, 16, hidden=(32, 32))
+    stage = Experiment(tiny("run_dir=unused", *overrides)).learn_stage(decoder)
+    stage.restart_collection()
+    return stage
+
+
+def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
+    return {key: value.clone() for key, value in module.state_dict().items()}
+
+
+def changed(module: nn.Module, before: dict[str, torch.Tensor]) -> bool:
+    return any(not torch.equal(value, before[key]) for key, value in module.state_dict().items())
+
+
+def fill(stage, batches: int = 6) -> None:
+    for _ in range(batches):
+        stage.collect()
+
+
+def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
+    stage = explore_stage()
+    fill(stage)
+    before = [snapshot(part) for part in (stage.policy, stage.encoder, stage.gmvae)]
+    stage.update()
+    assert changed(stage.policy, before[0])
+    assert changed(stage.encoder, before[1])
+    assert changed(stage.gmvae, before[2])
+    stage.close()
+
+
+def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
+    stage = explore_stage("explore.bonus.normalize=false")
+    fill(stage)
+
+    def bonus_and_expected():
+        torch.manual_seed(0)
+        batch = stage.buffer.sample()
+        with torch.no_grad():
+            phi, phi_next = (
+                stage.encoder.module(batch.get(key))
+                for key in ("observation", ("next", "observation"))
+            )
+        expected = ((phi_next - phi) * batch["direction"]).sum(-1, keepdim=True)
+        return batch["next", "intrinsic_reward"], expected
+
+    first, expected = bonus_and_expected()
+    torch.testing.assert_close(first, expected)
+    with torch.no_grad():
+        for parameter in stage.encoder.parameters():
+            parameter.mul_(1.5)
+    second, expected = bonus_and_expected()
+    torch.testing.assert_close(second, expected)
+    assert not torch.allclose(first, second)
+    stage.close()
+
+
+def test_directions_are_unit_vectors_kept_through_the_episode():
+    stage = explore_stage()
+    batch = stage.collect()
+    torch.testing.assert_close(batch["direction"].norm(dim=-1), torch.ones(len(batch)))
+    inside = ~batch["next", "done"].squeeze(-1)
+    assert torch.equal(batch["direction"][inside], batch["next", "direction"][inside])
+    stage.close()
+
+
+@pytest.mark.parametrize("actions", ["mean", "sampled"])
+def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
+    stage = explore_stage(f"explore.fit.actions={actions}")
+    batch = stage.collect()
+    shown = stage.buffer.storage[:]["shown_action"]
+    expected = batch["action"] if actions == "sampled" else torch.tanh(batch["loc"])
+    torch.testing.assert_close(shown, expected, atol=1e-5, rtol=1e-5)
+    stage.close()
+
+
+def test_the_better_share_is_the_better_rewarded_one():
+    stage = explore_stage("explore.fit.best_share=0.25")
+    fill(stage)
+    batch = stage.buffer.sample()
+    best = stage._best(batch)["action"]
+    reward = batch["next", "reward"].squeeze(-1)
+    threshold = reward.sort(descending=True).values[7]
+    assert best.shape[0] == 8
+    allowed = batch["shown_action"][reward >= threshold]
+    assert all((row == allowed).all(-1).any() for row in best)
+    stage.close()
+
+
+def test_pairs_in_the_buffer_are_the_executed_ones_while_the_decoder_changes():
+    stage = learn_stage()
+    expected = []
+    for _ in range(3):
+        batch = stage.collect()
+        with torch.no_grad():
+            expected.append(stage.decoder.module(batch["synergy"]))
+            for parameter in stage.decoder.parameters():
+                parameter.add_(0.05)  # the next batch must be decoded with these
+    kept = stage.buffer.storage[:]
+    torch.testing.assert_close(kept["action"], torch.cat(expected))
+    assert not torch.allclose(kept["action"], stage.decoder.module(kept["synergy"]), atol=1e-3)
+    stage.close()
+
+
+@pytest.mark.parametrize(
+    ("fine_tuning", "learns"), [("critic", True), ("reconstruction", True), ("frozen", False)]
+)
+def test_decoder_learns_only_in_the_modes_that_say_so(fine_tuning, learns):
+    stage = learn_stage(None, f"learn.fine_tuning={fine_tuning}", "learn.decoder_lr=1e-2")
+    fill(stage)
+    if fine_tuning == "reconstruction":  # on fresh pairs Eq. 10 has no gradient at all
+        with torch.no_grad():
+            stage.decoder.module.decoder.mlp[-1].bias.add_(0.1)
+    before, policy = snapshot(stage.decoder), snapshot(stage.policy)
+    stage.update()
+    assert changed(stage.decoder, before) is learns
+    assert changed(stage.policy, policy)
+    stage.close()
+
+
+def test_eq_10_is_self_distillation_on_fresh_pairs():
+    stage = learn_stage(None, "learn.fine_tuning=reconstruction", "learn.decoder_lr=1e-2")
+    fill(stage)
+    before = snapshot(stage.decoder)
+    assert stage.update()["loss_decoder"] < 1e-10
+    after = stage.decoder.state_dict()
+    assert all(torch.allclose(after[key], before[key], atol=1e-4) for key in before)
+    stage.close()
+
+
+def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
+    first = explore_stage()
+    fill(first)
+    for _ in range(3):
+        first.update()
+    decoder = first.finish()
+    before = copy.deepcopy([snapshot(first.encoder), snapshot(first.gmvae)])
+    second = learn_stage(decoder, "learn.decoder_lr=1e-2")
+    fill(second)
+    tuned = snapshot(second.decoder)
+    for _ in range(5):
+        second.update()
+    assert not changed(first.encoder, before[0])
+    assert not changed(first.gmvae, before[1])
+    assert changed(second.decoder, tuned)
+    first.close(), second.close()
+
+
+def test_updates_keep_the_ratio_that_was_asked_for():
+    stage = explore_stage("explore.updates_per_frame=0.1", "explore.learning_starts=0")
+    for _ in range(5):
+        stage.collect()
+        stage.learn()
+    assert stage.progress.frames == 160
+    assert stage.progress.updates == 16
+    stage.close()
+
+
+def test_gaussian_divergence_trains_its_latent_dynamics():
+    stage = explore_stage("explore.metric.divergence=gaussian")
+    fill(stage)
+    assert "loss_dynamics" in stage.update().keys()
+    stage.close()

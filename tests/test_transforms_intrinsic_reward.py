@@ -1,0 +1,339 @@
+import copy
+import io
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+
+from tests.point_env import HORIZON, OBSERVATION_DIM, PointEnv
+from tests.transform_checks import TransformChecks
+from torchrl_etl.modules import StateEncoder
+from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward
+
+K = 2
+
+
+def fixed_encoder(embedding_dim=K):
+    """The same weights in every process."""
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        return StateEncoder(OBSERVATION_DIM, embedding_dim, hidden=(8,))
+
+
+def doubler(size=1):
+    """φ(s) = 2 s."""
+    linear = nn.Linear(size, size, bias=False)
+    linear.weight.data = 2 * torch.eye(size)
+    return TensorDictModule(linear, in_keys=["observation"], out_keys=["embedding"])
+
+
+def transitions(starts, ends, directions, rewards=None):
+    """One-dimensional observations and directions."""
+    as_column = partial(torch.tensor, dtype=torch.float32)
+    data = TensorDict(
+        {
+            "observation": as_column(starts)[..., None],
+            "direction": as_column(directions)[..., None],
+            "next": {"observation": as_column(ends)[..., None]},
+        }
+    ).auto_batch_size_(as_column(starts).ndim)
+    if rewards is not None:
+        data["next", "reward"] = as_column(rewards)[..., None]
+    return data
+
+
+class TestIntrinsicReward(TransformChecks):
+    @staticmethod
+    def transform(nested=False):
+        def key(name):
+            return ("agent", name) if nested else name
+
+        return Compose(
+            DirectionPrimer(K, out_key=key("direction")),
+            IntrinsicReward(
+                fixed_encoder(),
+                in_keys=(key("observation"), key("direction")),
+                out_key=key("intrinsic_reward"),
+                reward_key=key("reward"),
+                normalize=False,
+            ),
+        )
+
+    def check_values(self, rollout):
+        encoder = fixed_encoder()
+        with torch.no_grad():
+            embedding = encoder(rollout.select("observation"))["embedding"]
+            following = encoder(rollout["next"].select("observation"))["embedding"]
+        expected = ((following - embedding) * rollout["direction"]).sum(-1, keepdim=True)
+        torch.testing.assert_close(rollout["next", "intrinsic_reward"], expected)
+        assert expected.abs().max() > 1e-3
+        assert set(rollout.keys()).isdisjoint({"embedding", "intrinsic_reward"})
+
+    @pytest.mark.slow
+    def test_parallel_workers_start_from_the_callers_root(self):
+        parallel = ParallelEnv(2, self.env, mp_start_method="fork")
+        try:
+            state = parallel.rand_action(parallel.reset())
+            state["observation"] += 5
+            self.check_values(parallel.step(state)[:, None])
+        finally:
+            parallel.close(raise_if_closed=False)
+
+    def test_state_dict_round_trip(self):
+        first, second = (IntrinsicReward(fixed_encoder(), decay=0.9) for _ in range(2))
+        data = self.env().rollout(4)
+        first(data)
+        first(data[:2])
+        assert set(first.state_dict()) == {
+            "deviation.mean",
+            "deviation.variance",
+            "deviation.weight",
+        }, "the encoder is its trainer's to save"
+        second.load_state_dict(first.state_dict())
+        for transform in (first, second):
+            transform.update_statistics = False
+        key = ("next", "intrinsic_reward")
+        assert torch.equal(first(data.clone())[key], second(data.clone())[key])
+
+    def test_no_env(self):
+        data = transitions([1.0, 0.0], [4.0, 1.0], [1.0, -1.0])
+        reward = IntrinsicReward(doubler(), normalize=False)(data)["next", "intrinsic_reward"]
+        assert reward.tolist() == [[6.0], [-2.0]]
+
+    def test_time_dimensions(self):
+        data = transitions([[1.0, 4.0]], [[4.0, 3.0]], [[1.0, 1.0]])
+        assert data.batch_size == (1, 2)
+        IntrinsicReward(doubler(), normalize=False)(data)
+        assert data["next", "intrinsic_reward"].tolist() == [[[6.0], [-2.0]]]
+
+    def test_compose(self):
+        data = transitions([1.0], [4.0], [1.0])
+        del data["direction"]
+        transform = IntrinsicReward(doubler(), normalize=False)
+        data = Compose(DirectionPrimer(1), transform)(data)
+        assert data["next", "intrinsic_reward"].abs().tolist() == [[6.0]]
+
+    def test_model(self):
+        network = TensorDictModule(
+            nn.Linear(1, 2), in_keys=[("next", "intrinsic_reward")], out_keys=["out"]
+        )
+        transform = IntrinsicReward(doubler())
+        for model in (
+            nn.Sequential(transform, network),
+            TensorDictSequential(transform, network),
+        ):
+            assert model(transitions([1.0], [4.0], [1.0]))["out"].shape == (1, 2)
+
+    @pytest.mark.parametrize("appended", [False, True])
+    def test_replay_buffer(self, appended):
+        encoder = doubler()
+        transform = IntrinsicReward(encoder, normalize=False)
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(8), batch_size=8, transform=None if appended else transform
+        )
+        if appended:
+            buffer.append_transform(transform)
+        buffer.extend(transitions([1.0, 0.0], [4.0, 1.0], [1.0, -1.0]))
+        key = ("next", "intrinsic_reward")
+        assert key not in buffer._storage[:].keys(True, True), "nothing is written on extend"
+        assert set(buffer.sample()[key].flatten().tolist()) == {6.0, -2.0}
+        encoder.module.weight.data *= 10
+        assert set(buffer.sample()[key].flatten().tolist()) == {60.0, -20.0}, "never stale"
+        assert key not in buffer._storage[:].keys(True, True)
+
+    def test_inverse(self):
+        data = transitions([1.0], [4.0], [1.0])
+        assert (self.transform().inv(data) == data).all()
+
+
+def test_bonus_telescopes_over_an_episode():
+    encoder = fixed_encoder()
+    env = TransformedEnv(
+        PointEnv(), Compose(DirectionPrimer(K), IntrinsicReward(encoder, normalize=False))
+    )
+    rollout = env.rollout(HORIZON)
+    with torch.no_grad():
+        first = encoder(rollout[0].select("observation"))["embedding"]
+        last = encoder(rollout[-1]["next"].select("observation"))["embedding"]
+    total = rollout["next", "intrinsic_reward"].sum()
+    torch.testing.assert_close(total, (last - first) @ rollout["direction"][0])
+
+
+@pytest.mark.parametrize(("weight", "expected"), [(0.0, 6.0), (1.0, 16.0), (0.5, 11.0)])
+def test_extrinsic_weight_adds_the_task_reward(weight, expected):
+    data = transitions([1.0], [4.0], [1.0], rewards=[10.0])
+    IntrinsicReward(doubler(), normalize=False, extrinsic_weight=weight)(data)
+    assert data["next", "intrinsic_reward"].item() == expected
+    assert data["next", "reward"].item() == 10.0
+
+
+def test_extrinsic_reward_is_added_after_the_division():
+    data = transitions([0.0, 0.0], [1.0, -1.0], [1.0, 1.0], rewards=[10.0, 10.0])
+    IntrinsicReward(doubler(), extrinsic_weight=1.0)(data)
+    torch.testing.assert_close(data["next", "intrinsic_reward"].flatten(), torch.tensor([11.0, 9]))
+
+
+def test_division_keeps_the_sign_and_makes_the_deviation_one():
+    ends = 3 + 5 * torch.randn(4_000, generator=torch.Generator().manual_seed(0))
+    data = transitions([0.0] * 4_000, ends.tolist(), [1.0] * 4_000)
+    bonus = IntrinsicReward(doubler())(data)["next", "intrinsic_reward"].flatten()
+    assert abs(bonus.std(correction=0) - 1) < 1e-5
+    # Were the mean subtracted, it would be 0 and small positive bonuses would turn negative.
+    torch.testing.assert_close(bonus.mean(), ends.mean() / ends.std(correction=0))
+    assert torch.equal(bonus.sign(), ends.sign())
+
+
+def test_statistics_are_a_bias_corrected_moving_average():
+    transform = IntrinsicReward(doubler(), decay=0.5)
+    batches = [[1.0, 3.0], [0.0, 8.0], [-2.0, 2.0]]
+    for ends in batches:
+        transform(transitions([0.0, 0.0], ends, [1.0, 1.0]))
+    # Weights 1/8, 1/4, 1/2 of the three batches, over their sum; bonuses are twice the ends.
+    weights = torch.tensor([1.0, 2.0, 4.0]) / 7
+    values = 2 * torch.tensor(batches)
+    mean = (weights * values.mean(1)).sum()
+    variance = (weights * values.square().mean(1)).sum() - mean.square()
+    torch.testing.assert_close(transform.deviation.mean, mean)
+    torch.testing.assert_close(transform.deviation.variance, variance)
+    torch.testing.assert_close(transform.deviation.divisor, variance.sqrt())
+
+
+def test_scale_follows_an_encoder_that_grows():
+    encoder = doubler()
+    transform = IntrinsicReward(encoder, decay=0.9)
+    data = transitions([0.0] * 4, [1.0, -1.0, 2.0, -2.0], [1.0] * 4)
+    early = transform(data.clone())["next", "intrinsic_reward"]
+    encoder.module.weight.data *= 100
+    for _ in range(100):
+        late = transform(data.clone())["next", "intrinsic_reward"]
+    torch.testing.assert_close(late, early, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("update", [True, False])
+def test_zero_bonus_on_a_fresh_transform_is_zero(update):
+    transform = IntrinsicReward(doubler(), update_statistics=update)
+    for _ in range(3):
+        data = transform(transitions([1.0, 2.0], [1.0, 2.0], [1.0, 1.0]))
+        assert data["next", "intrinsic_reward"].tolist() == [[0.0], [0.0]]
+
+
+def test_constant_bonus_is_not_blown_up():
+    transform = IntrinsicReward(doubler())
+    for _ in range(5):
+        data = transform(transitions([0.0], [0.3], [1.0]))
+        assert data["next", "intrinsic_reward"].item() == pytest.approx(10.0, rel=1e-4)
+
+
+def test_without_updates_a_fresh_transform_leaves_the_bonus_as_it_is():
+    transform = IntrinsicReward(doubler(), update_statistics=False)
+    data = transform(transitions([0.0, 0.0], [1.0, -3.0], [1.0, 1.0]))
+    assert data["next", "intrinsic_reward"].flatten().tolist() == [2.0, -6.0]
+
+
+def test_statistics_go_on_in_eval_mode_and_stop_when_told():
+    env = TransformedEnv(
+        PointEnv(), Compose(DirectionPrimer(K), IntrinsicReward(fixed_encoder(), decay=0.9))
+    )
+    transform = env.transform[1]
+    assert not transform.training, "TorchRL puts env transforms in eval mode"
+    env.rollout(3)
+    assert transform.deviation.weight.item() == pytest.approx(1 - 0.9**3)
+    transform.update_statistics = False
+    env.rollout(3)
+    assert transform.deviation.weight.item() == pytest.approx(1 - 0.9**3)
+
+
+def test_encoder_is_held_by_reference_and_left_alone():
+    encoder = fixed_encoder().train()
+    transform = IntrinsicReward(encoder)
+    env = TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), transform))
+    env.rollout(2)
+    assert transform.encoder is encoder and transform.clone().encoder is encoder
+    assert encoder.training and all(p.requires_grad for p in encoder.parameters())
+    assert not list(transform.parameters())
+    assert not transform(env.rollout(2))["next", "intrinsic_reward"].requires_grad
+
+
+def test_encoder_keeps_its_device_when_the_transform_moves():
+    encoder = fixed_encoder()
+    IntrinsicReward(encoder).to("meta")
+    assert {p.device.type for p in encoder.parameters()} == {"cpu"}
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize(("of_encoder", "of_data"), [("cuda", "cpu"), ("cpu", "cuda")])
+def test_encoder_may_live_on_another_device_than_the_data(of_encoder, of_data):
+    data = transitions([1.0, 0.0], [4.0, 1.0], [1.0, -1.0])
+    expected = IntrinsicReward(doubler())(data.clone())["next", "intrinsic_reward"]
+    reward = IntrinsicReward(doubler().to(of_encoder))(data.to(of_data))["next", "intrinsic_reward"]
+    assert reward.device.type == of_data
+    torch.testing.assert_close(reward.cpu(), expected)
+
+
+def test_transform_survives_serialization_and_deepcopy():
+    transform = IntrinsicReward(doubler(), normalize=False)
+    file = io.BytesIO()
+    torch.save(transform, file)
+    file.seek(0)
+    for twin in (torch.load(file, weights_only=False), copy.deepcopy(transform)):
+        data = twin(transitions([1.0], [4.0], [1.0]))
+        assert data["next", "intrinsic_reward"].item() == 6.0
+
+
+def test_reward_spec_declares_the_bonus():
+    env = TransformedEnv(
+        SerialEnv(2, PointEnv), Compose(DirectionPrimer(K), IntrinsicReward(fixed_encoder()))
+    )
+    assert env.full_reward_spec["intrinsic_reward"].shape == (2, 1)
+    assert env.reward_keys == ["intrinsic_reward", "reward"]
+
+
+def test_encoder_without_keys_is_refused():
+    with pytest.raises(TypeError, match="Linear without in_keys"):
+        IntrinsicReward(nn.Linear(1, 1))
+
+
+def test_encoder_with_two_inputs_is_refused():
+    encoder = TensorDictModule(nn.Bilinear(1, 1, 1), in_keys=["a", "b"], out_keys=["c"])
+    with pytest.raises(ValueError, match=r"reads \['a', 'b'\]"):
+        IntrinsicReward(encoder)
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.0, -0.1, 1.5])
+def test_decay_outside_the_open_interval_is_refused(decay):
+    with pytest.raises(ValueError, match=f"decay is {decay}"):
+        IntrinsicReward(doubler(), decay=decay)
+
+
+@pytest.mark.parametrize("in_keys", ["observation", ("observation",)])
+def test_in_keys_must_be_a_pair(in_keys):
+    with pytest.raises(ValueError, match="pass a pair"):
+        IntrinsicReward(doubler(), in_keys=in_keys)
+
+
+def test_embedding_and_direction_of_different_size_are_refused_with_both_sizes():
+    env = TransformedEnv(PointEnv(), Compose(DirectionPrimer(3), IntrinsicReward(fixed_encoder(2))))
+    with pytest.raises(ValueError, match="has 2 dimensions but 'direction' has 3"):
+        env.rollout(1)
+
+
+def test_env_without_direction_is_refused():
+    env = TransformedEnv(PointEnv(), IntrinsicReward(fixed_encoder()))
+    with pytest.raises(KeyError, match="DirectionPrimer"):
+        env.rollout(1)
+
+
+def test_missing_entries_are_named():
+    data = transitions([1.0], [4.0], [1.0])
+    with pytest.raises(KeyError, match="reward"):
+        IntrinsicReward(doubler(), extrinsic_weight=1.0)(data)
+    with pytest.raises(KeyError, match="direction"):
+        IntrinsicReward(doubler())(data.exclude("direction"))
+    with pytest.raises(KeyError, match="'next'"):
+        IntrinsicReward(doubler())(data.exclude("next"))

@@ -1,0 +1,343 @@
+"""Numbers that tell whether a synergy space is worth learning in."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from sklearn.decomposition import NMF, PCA
+from sklearn.exceptions import ConvergenceWarning
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchrl_etl.modules import GMVAE, SynergyDecoder
+
+__all__ = [
+    "MixtureUsage",
+    "as_matrix",
+    "control_authority",
+    "mixture_usage",
+    "nmf_vaf",
+    "pca_vaf",
+    "synergy_effects",
+    "synergy_warnings",
+    "variance_accounted_for",
+]
+
+
+def variance_accounted_for(
+    actions: Tensor | ArrayLike, reconstruction: Tensor | ArrayLike
+) -> float:
+    """Variance accounted for: 1 − Σ‖a − â‖² / Σ‖a − ā‖², with ā the mean action.
+
+    1 is a perfect reconstruction, 0 is no better than always answering the mean action, and less
+    than 0 is worse than that. Constant actions have no variance to account for: the result is then
+    1 if they are reconstructed to rounding error, else 0.
+
+    Args:
+        actions (Tensor or array): actions [*, n].
+        reconstruction (Tensor or array): their reconstructions, of the same shape.
+
+    Raises:
+        ValueError: if the shapes differ, there are no actions, or a number is not finite.
+
+    Examples:
+        >>> variance_accounted_for([[0.0], [2.0], [4.0]], [[1.0], [2.0], [3.0]])
+        0.75
+    """
+    actions = as_matrix(actions, "actions")
+    reconstruction = as_matrix(reconstruction, "reconstruction")
+    if actions.shape != reconstruction.shape:
+        raise ValueError(
+            f"actions flatten to {actions.shape} but reconstruction to {reconstruction.shape}; "
+            "pass one reconstructed action per action."
+        )
+    missed = float(np.square(actions - reconstruction).sum())
+    total = float(np.square(actions - actions.mean(0)).sum())
+    # Rounding leaves a constant column a variance of some (1e-16)² relative to its size, and
+    # float32 data a residual of (1e-7)².
+    size = float(np.square(actions).sum())
+    if total <= 1e-24 * size:
+        return 1.0 if missed <= 1e-12 * size else 0.0
+    return 1.0 - missed / total
+
+
+def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int = 50_000) -> float:
+    """Variance that the best ``num_synergies`` linear directions account for.
+
+    No linear decoder with an offset can do better on these actions, so a nonlinear one should.
+
+    Args:
+        actions (Tensor or array): actions [*, n].
+        num_synergies (int): number d of principal components.
+
+    Keyword Args:
+        max_samples (int): more actions than this are subsampled, with a fixed seed.
+
+    Raises:
+        ValueError: if d exceeds the number of actuators or actions, or an action is not finite.
+
+    Examples:
+        >>> round(pca_vaf([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]], num_synergies=1), 6)
+        1.0
+    """
+    actions = _subsample(as_matrix(actions, "actions"), max_samples)
+    _check_rank(num_synergies, actions)
+    # scikit-learn divides by the total variance on its way, which constant actions do not have;
+    # the components are good either way.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        model = PCA(num_synergies, svd_solver="covariance_eigh").fit(actions)
+    return variance_accounted_for(actions, model.inverse_transform(model.transform(actions)))
+
+
+def nmf_vaf(
+    actions: Tensor | ArrayLike,
+    num_synergies: int,
+    low: float | Tensor | ArrayLike = -1.0,
+    *,
+    max_samples: int = 5_000,
+) -> float:
+    """Variance that non-negative matrix factorisation with ``num_synergies`` parts accounts for.
+
+    This is how motor control research extracts muscle synergies from recordings. It sees a − low,
+    which is never negative; the variance is still taken about the mean action, so the number
+    compares with the other two. NMF has no offset of its own: with few parts it can fall below 0.
+
+    Args:
+        actions (Tensor or array): actions [*, n].
+        num_synergies (int): number d of parts.
+        low (float, Tensor or array): lower action bound, one or [n]. Default: -1.
+
+    Keyword Args:
+        max_samples (int): more actions than this are subsampled, with a fixed seed.
+
+    Raises:
+        ValueError: if an action is below ``low``, d exceeds the number of actuators or actions, or
+            an action is not finite.
+
+    Examples:
+        >>> parts = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5]])
+        >>> weights = torch.rand(64, 2, generator=torch.Generator().manual_seed(0))
+        >>> round(nmf_vaf(weights @ parts, num_synergies=2, low=0.0), 2)
+        1.0
+    """
+    actions = _subsample(as_matrix(actions, "actions"), max_samples)
+    _check_rank(num_synergies, actions)
+    shifted = actions - _array(low)
+    if shifted.min() < -1e-4:
+        raise ValueError(
+            f"An action lies {-shifted.min():.3g} below the lower bound; pass the bound of these "
+            "actions' own spec as low."
+        )
+    shifted = shifted.clip(min=0.0)
+    model = NMF(num_synergies, init="nndsvda", max_iter=500, random_state=0)
+    with warnings.catch_warnings():
+        # The last digits that more iterations would bring do not change a verdict.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        weights = model.fit_transform(shifted)
+    return variance_accounted_for(shifted, weights @ model.components_)
+
+
+@torch.no_grad()
+def control_authority(
+    decoder: SynergyDecoder, num_samples: int = 1024, *, generator: torch.Generator | None = None
+) -> Tensor:
+    """How far the synergies move each actuator, as a fraction of its range [n].
+
+    It is the distance from the 5th to the 95th percentile of Dec(u), u uniform in [-1, 1]^d, over
+    high − low: 0.9 for a muscle that follows one coefficient linearly over its whole range, 0 for
+    one that never moves. A residual, if the decoder has one, is held at zero. The mean over
+    actuators is the summary.
+
+    Args:
+        decoder (SynergyDecoder): the decoder.
+        num_samples (int): number of random coefficients. Default: 1024.
+
+    Keyword Args:
+        generator (torch.Generator, optional): source of the samples. Default: a fresh one with a
+            fixed seed, so that two calls agree and no global state moves.
+
+    Raises:
+        ValueError: if there are fewer than two samples.
+
+    Examples:
+        >>> from torchrl_etl.modules import GMVAE, SynergyDecoder
+        >>> authority = control_authority(SynergyDecoder.from_gmvae(GMVAE(39, 4)))
+        >>> authority.shape, bool((authority > 0).all() and (authority < 1).all())
+        (torch.Size([39]), True)
+    """
+    if num_samples < 2:
+        raise ValueError(f"num_samples is {num_samples}; percentiles need at least 2, say 1024.")
+    if generator is None:
+        generator = torch.Generator().manual_seed(0)
+    synergies = torch.rand(
+        num_samples, decoder.num_synergies, generator=generator, device=generator.device
+    )
+    action = _decode(decoder, 2 * synergies - 1)
+    low, high = action.quantile(torch.tensor([0.05, 0.95], device=action.device), dim=0)
+    return (high - low) / (decoder.high - decoder.low)
+
+
+@torch.no_grad()
+def synergy_effects(decoder: SynergyDecoder) -> Tensor:
+    """Signed change of each actuator when one coefficient goes from -1 to +1 [d, n].
+
+    The other coefficients are 0, and so is a residual; 1 means the actuator's whole range.
+
+    Args:
+        decoder (SynergyDecoder): the decoder.
+
+    Examples:
+        >>> from torchrl_etl.modules import GMVAE, SynergyDecoder
+        >>> synergy_effects(SynergyDecoder.from_gmvae(GMVAE(39, 4))).shape
+        torch.Size([4, 39])
+    """
+    one_at_a_time = torch.eye(decoder.num_synergies)
+    change = _decode(decoder, one_at_a_time) - _decode(decoder, -one_at_a_time)
+    return change / (decoder.high - decoder.low)
+
+
+class MixtureUsage(NamedTuple):
+    """Share of the actions in each component [C], and how many components that amounts to."""
+
+    shares: Tensor
+    effective: float
+
+
+@torch.no_grad()
+def mixture_usage(gmvae: GMVAE, actions: Tensor) -> MixtureUsage:
+    """Mean q(c|a) over ``actions``, and exp of its entropy: the effective number of components.
+
+    Args:
+        gmvae (GMVAE): the fitted model.
+        actions (Tensor): actions [*, n] in action units.
+
+    Raises:
+        ValueError: if there are no actions.
+
+    Examples:
+        >>> from torchrl_etl.modules import GMVAE
+        >>> usage = mixture_usage(GMVAE(39, 4), torch.rand(64, 39))
+        >>> usage.shares.shape, 1.0 <= usage.effective <= 4.001
+        (torch.Size([4]), True)
+    """
+    actions = actions.reshape(-1, actions.shape[-1])
+    if not len(actions):
+        raise ValueError("There are no actions to assign to components; pass at least one.")
+    # In pieces: all hidden layers at once would take far more memory than the answer.
+    shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
+    shares = shares / len(actions)
+    return MixtureUsage(shares, torch.special.entr(shares).sum().exp().item())
+
+
+def synergy_warnings(
+    *,
+    vaf: float,
+    pca_vaf: float,
+    authority: Tensor | ArrayLike,
+    usage: MixtureUsage | None = None,
+    min_vaf: float = 0.5,
+    pca_tolerance: float = 0.02,
+    min_authority: float = 0.2,
+    min_components: float = 1.5,
+) -> list[str]:
+    """Say in words what is wrong with a synergy space; an empty list means nothing was found.
+
+    Keyword Args:
+        vaf (float): variance that the GMVAE accounts for.
+        pca_vaf (float): variance that PCA accounts for with as many dimensions.
+        authority (Tensor or array): what :func:`control_authority` returned [n].
+        usage (MixtureUsage, optional): what :func:`mixture_usage` returned.
+        min_vaf (float): a lower PCA variance means that the actions have no low-dimensional
+            structure. Default: 0.5.
+        pca_tolerance (float): how far the GMVAE may stay behind PCA. Default: 0.02.
+        min_authority (float): lowest acceptable mean authority. Default: 0.2.
+        min_components (float): lowest acceptable effective number of components. Default: 1.5.
+
+    Returns:
+        list of str: one sentence per finding, with its numbers and what helps.
+
+    Examples:
+        >>> synergy_warnings(vaf=0.9, pca_vaf=0.85, authority=[0.5, 0.7])
+        []
+        >>> for line in synergy_warnings(vaf=0.9, pca_vaf=0.85, authority=[0.004, 0.1]):
+        ...     print(line)
+        The synergies move an actuator over 5% of its range on average (20% is the least
+        advised; 1 of 2 actuators move less than 1%): learn on them only with a residual, or fit
+        the GMVAE longer, on actions that vary more.
+    """
+    found = []
+    if pca_vaf < min_vaf:
+        found.append(
+            f"The actions hardly have synergies: PCA accounts for {pca_vaf:.0%} of their variance "
+            f"with as many dimensions ({min_vaf:.0%} is the least advised); fit on the policy's "
+            "mean actions or on muscle activations instead of sampled actions, or raise the number "
+            "of synergies."
+        )
+    if vaf < pca_vaf - pca_tolerance:
+        found.append(
+            f"The GMVAE accounts for {vaf:.1%} of the actions' variance, less than PCA's "
+            f"{pca_vaf:.1%} with as many dimensions: it is underfitted, so train it longer or "
+            "lower the weight of its KL terms."
+        )
+    authority = _array(authority)
+    if authority.mean() < min_authority:
+        still = int((authority < 0.01).sum())
+        idle = f"; {still} of {authority.size} actuators move less than 1%" if still else ""
+        found.append(
+            f"The synergies move an actuator over {authority.mean():.0%} of its range on average "
+            f"({min_authority:.0%} is the least advised{idle}): learn on them only with a "
+            "residual, or fit the GMVAE longer, on actions that vary more."
+        )
+    if usage is not None and len(usage.shares) > 1 and usage.effective < min_components:
+        found.append(
+            f"The mixture has collapsed: {usage.effective:.1f} of its {len(usage.shares)} "
+            f"components are in use, the largest for {float(usage.shares.max()):.0%} of the "
+            "actions; lower the weight of the component KL, or ask for fewer components."
+        )
+    return found
+
+
+def _decode(decoder: SynergyDecoder, synergies: Tensor) -> Tensor:
+    silent = synergies.new_zeros(len(synergies), decoder.synergy_dim - decoder.num_synergies)
+    return decoder(torch.cat([synergies, silent], -1).to(decoder.low.device))
+
+
+def _array(values: Tensor | ArrayLike) -> np.ndarray:
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=np.float64)
+
+
+def as_matrix(values: Tensor | ArrayLike, name: str) -> np.ndarray:
+    """Finite numbers [*, n] as a float64 array [N, n]; ``name`` is what an error calls them.
+
+    Examples:
+        >>> as_matrix(torch.zeros(2, 3, 4), "actions").shape
+        (6, 4)
+    """
+    array = _array(values)
+    if array.ndim < 2 or array.size == 0:
+        raise ValueError(
+            f"{name} have shape {array.shape}; at least one action is needed, as an array [*, n]."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} hold numbers that are not finite; drop those rows first.")
+    return array.reshape(-1, array.shape[-1])
+
+
+def _subsample(actions: np.ndarray, count: int) -> np.ndarray:
+    if len(actions) <= count:
+        return actions
+    return actions[np.random.default_rng(0).choice(len(actions), count, replace=False)]
+
+
+def _check_rank(num_synergies: int, actions: np.ndarray) -> None:
+    if not 1 <= num_synergies <= min(actions.shape):
+        raise ValueError(
+            f"num_synergies is {num_synergies}; with {len(actions)} actions of "
+            f"{actions.shape[1]} actuators it must lie in 1..{min(actions.shape)}."
+        )

@@ -1,0 +1,116 @@
+"""Confidence intervals for returns and success rates."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import DegenerateDataWarning, binomtest, bootstrap
+
+__all__ = ["Interval", "interval", "success_interval"]
+
+# Resamples drawn at once: keeps the bootstrap of some 10,000 episodes within tens of megabytes.
+_BATCH_ELEMENTS = 4_000_000
+
+
+class Interval(NamedTuple):
+    """A mean and the two ends of its confidence interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
+    """Mean of ``values`` with a bootstrap confidence interval.
+
+    The interval is bias-corrected and accelerated (BCa). Where that is undefined, as for constant
+    data, it is the percentile interval. Booleans are outcomes, so they go to
+    :func:`success_interval`. The resampling is seeded: the same values give the same interval.
+
+    Args:
+        values (array-like): independent numbers, such as one return per seed.
+        confidence (float): in (0, 1). Default: 0.95.
+
+    Returns:
+        Interval: mean, low, high. One value alone says nothing about its spread: its ends are NaN.
+
+    Raises:
+        ValueError: if there are no values, one is not finite, or the confidence is outside (0, 1).
+
+    Examples:
+        >>> interval([3.0, 3.0, 3.0])
+        Interval(mean=3.0, low=3.0, high=3.0)
+        >>> mean, low, high = interval([10.0, 12.0, 9.0, 15.0, 11.0])
+        >>> mean, low < mean < high
+        (11.4, True)
+    """
+    array = np.asarray(values).ravel()
+    _check(array.size, confidence)
+    if array.dtype == bool:
+        return success_interval(array, confidence)
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(
+            f"{int((~np.isfinite(array)).sum())} of {array.size} values are not finite; an "
+            "interval needs finite numbers. Drop the failed runs and report how many there were."
+        )
+    mean = float(array.mean())
+    if array.size == 1:
+        return Interval(mean, float("nan"), float("nan"))
+    for method in ("BCa", "percentile"):
+        with warnings.catch_warnings():
+            # A degenerate BCa divides zero by zero on its way to the NaN that is handled below.
+            warnings.simplefilter("ignore", DegenerateDataWarning)
+            warnings.simplefilter("ignore", RuntimeWarning)
+            ends = bootstrap(
+                (array,),
+                np.mean,
+                confidence_level=confidence,
+                method=method,
+                batch=max(1, _BATCH_ELEMENTS // array.size),
+                rng=np.random.default_rng(0),
+            ).confidence_interval
+        if np.isfinite(ends).all():
+            break
+    return Interval(mean, float(ends.low), float(ends.high))
+
+
+def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.95) -> Interval:
+    """Share of solved episodes with its Wilson score interval.
+
+    Unlike a bootstrap, it keeps a sensible width when every episode was solved, or none was.
+
+    Args:
+        solved (sequence of bool): one outcome per episode; numbers 0 and 1 will do.
+        confidence (float): in (0, 1). Default: 0.95.
+
+    Raises:
+        ValueError: if there are no outcomes, one is neither 0 nor 1, or the confidence is outside
+            (0, 1).
+
+    Examples:
+        >>> share, low, high = success_interval([True] * 10)
+        >>> share, round(low, 3), high
+        (1.0, 0.722, 1.0)
+    """
+    array = np.asarray(solved).ravel()
+    _check(array.size, confidence)
+    if not np.isin(array, (0, 1)).all():
+        raise ValueError(
+            "Some outcomes are neither 0 nor 1; pass one boolean per episode, or use interval() "
+            "for a mean of other numbers."
+        )
+    count = int(array.sum())
+    ends = binomtest(count, array.size).proportion_ci(confidence, method="wilson")
+    return Interval(count / array.size, float(ends.low), float(ends.high))
+
+
+def _check(count: int, confidence: float) -> None:
+    if count == 0:
+        raise ValueError("There are no values to average; pass at least one.")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence is {confidence}; it must lie between 0 and 1, such as 0.95.")

@@ -1,0 +1,60 @@
+"""What the recipes share: a typo gets the nearest right word, a fault one sentence."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+__all__ = ["check_overrides", "one_sentence", "quiet_torchrl"]
+
+
+def check_overrides(config: Path, arguments: list[str]) -> None:
+    """Leave with the nearest key if an override names one that does not exist.
+
+    Hydra would refuse it too, but without a suggestion.
+
+    Args:
+        config (path): the primary YAML file; folders beside it are groups.
+        arguments (list of str): the command line without the program.
+    """
+    known = list(_keys(OmegaConf.load(config)))
+    known += [group.name for group in config.parent.iterdir() if group.is_dir()]
+    for argument in arguments:
+        key, separator, _ = argument.partition("=")
+        if argument.startswith(("-", "+", "~")) or key.startswith("hydra"):
+            continue
+        if not separator:
+            sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=3)
+            hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
+            sys.exit(f"Error: there is no setting {key!r}; {hint}")
+
+
+@contextmanager
+def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
+    """Turn faults of these kinds, which explain themselves, into one line and exit code 2."""
+    try:
+        yield
+    except kinds as error:
+        print(f"Error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def quiet_torchrl() -> None:
+    """Keep TorchRL's storage notices out of the progress bar."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in config:
+        yield f"{prefix}{key}"
+        value = config._get_node(key)
+        if isinstance(value, DictConfig):
+            yield from _keys(value, f"{prefix}{key}.")

@@ -1,0 +1,215 @@
+"""One way to build any task: simulator, small wrappers, one TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import torch
+from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, GymWrapper
+
+from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
+from torchrl_etl.envs.tasks import Goal, Task, resolve_task
+from torchrl_etl.envs.wrappers import (
+    SUCCESS_KEYS,
+    FiniteGuard,
+    NamedObservation,
+    SeededVectorEnv,
+    SinglePrecision,
+)
+
+__all__ = ["actuator_names", "make_env"]
+
+
+def make_env(
+    name: str,
+    *,
+    num_envs: int = 1,
+    goal: Goal | None = None,
+    seed: int | None = None,
+    device: torch.device | str | None = None,
+    activations: bool = False,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> EnvBase:
+    """Builds a task as a TorchRL environment.
+
+    MyoSuite, DMControl and Gymnasium tasks take the same path. With several environments, their
+    simulators are stepped in turn below a single TorchRL environment of batch size ``[num_envs]``:
+    TorchRL's own work is then done once a batch. Use several collector workers for parallelism.
+    Simulators are imported here and not at the top of the module, so a worker process that
+    calls this function registers what it needs.
+
+    Args:
+        name (str): a task of :func:`~torchrl_etl.envs.list_tasks`, ``"overactuated"``, a registered
+            Gymnasium id, or a DMControl ``"domain-task"``.
+
+    Keyword Args:
+        num_envs (int): number of simulators; one gives an environment of batch size ``[]``.
+            Defaults to 1.
+        goal (str, optional): ``"fixed"`` or ``"random"``, see
+            :func:`~torchrl_etl.envs.resolve_task`.
+        seed (int, optional): seeds the environment, as ``env.set_seed(seed)`` does at any time
+            later. After ``env.set_seed(s); env.reset()``, a used environment and a fresh one give
+            bit-identical rollouts for the same actions. Each simulator of a batch gets
+            a seed of its own.
+        device (torch.device, optional): where the tensors go; simulation stays on the CPU.
+        activations (bool): adds ``activation``, the muscle activations in units of the
+            action (MyoSuite only). Defaults to ``False``.
+        env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
+            ``dm_control.suite.load``.
+
+    Returns:
+        EnvBase: the environment.
+
+    Keys:
+        - ``observation`` [O], float32, flat. DMControl's parts are joined in alphabetical order.
+        - ``action`` [n], float32, within the bounds that the simulator declares: [-1, 1] for
+          MyoSuite's hands and arm and for DMControl, [0, 1] for MyoSuite's legs.
+        - ``reward`` [1]; ``done``, ``terminated``, ``truncated`` [1]. Time limits truncate.
+        - ``solved`` [1], bool, where the task defines it: whether this very step meets the task's
+          criterion. ``False`` at reset.
+        - ``activation`` [n], if asked for.
+
+    Raises:
+        ValueError: for an unknown name, a goal that the task lacks, or actions that are not
+            continuous. While it runs, the environment raises
+            :class:`~torchrl_etl.envs.SimulationError` if a value is not finite.
+
+    Examples:
+        >>> from torchrl_etl.envs import make_env
+        >>> env = make_env("overactuated", num_envs=2, seed=0)
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "observation"].shape, rollout["action"].shape
+        (torch.Size([2, 3, 6]), torch.Size([2, 3, 16]))
+        >>> rollout["next", "solved"].shape, rollout["next", "solved"].dtype
+        (torch.Size([2, 3, 1]), torch.bool)
+    """
+    if not isinstance(num_envs, int) or num_envs < 1:
+        raise ValueError(f"num_envs must be a positive integer, got {num_envs!r}.")
+    task = resolve_task(name, goal)
+    build = partial(_build, task, activations=activations, env_kwargs=dict(env_kwargs or {}))
+    with quiet_compiler():
+        if num_envs == 1:
+            env = GymWrapper(build(), device=device)
+        else:
+            env = _BatchedGymWrapper(SeededVectorEnv([build] * num_envs), device=device)
+    if seed is not None:
+        env.set_seed(seed)
+    return env
+
+
+def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
+    """Returns the names of a task's actuators, in the order of its action.
+
+    MyoSuite builds some hands with the suffix ``_r`` on every name, and others without. A suffix
+    that every name carries says nothing, so it is left out: the muscles of Hand Pose and of
+    Key Turn are then the same by name. Legs, which have both sides, keep theirs.
+
+    Args:
+        env (str or EnvBase or gymnasium.Env): a task's name, or an environment on one.
+
+    Returns:
+        list of str: one name for each entry of the action.
+
+    Raises:
+        ValueError: if the environment has no MuJoCo model to read.
+
+    Examples:
+        >>> from torchrl_etl.envs import actuator_names
+        >>> actuator_names("overactuated")[:2]
+        ['muscle_0', 'muscle_1']
+    """
+    if isinstance(env, str):
+        with quiet_compiler():
+            simulator = _simulator(resolve_task(env), {})[0]
+        try:
+            return actuator_names(simulator)
+        finally:
+            simulator.close()
+    inner = env
+    while not isinstance(inner, gym.Env):
+        if isinstance(inner, gym.vector.VectorEnv):
+            inner = inner.unwrapped.envs[0]
+        elif isinstance(inner, GymWrapper):
+            inner = inner._env
+        elif hasattr(inner, "base_env"):
+            inner = inner.base_env
+        else:
+            raise ValueError(
+                f"Cannot read actuator names of a {type(env).__name__}; name the task."
+            )
+    names = _raw_actuator_names(inner.unwrapped)
+    if all(name.endswith("_r") for name in names):
+        return [name.removesuffix("_r") for name in names]
+    return names
+
+
+class _BatchedGymWrapper(GymWrapper):
+    """``GymWrapper`` whose reset takes a tensordict without mask, and a mask on any device.
+
+    Such a tensordict carries what transforms need at a reset (a chosen direction, for one);
+    TorchRL 0.14 then looks for a mask in vain, and takes the one it finds to be on the CPU.
+    """
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is not None:
+            mask = TensorDict({"_reset": mask.cpu()}, batch_size=self.batch_size)
+        return super()._reset(mask, **kwargs)
+
+
+def _raw_actuator_names(simulation: Any) -> list[str]:
+    if hasattr(simulation, "actuator_names"):
+        return list(simulation.actuator_names)
+    if hasattr(simulation, "physics"):
+        model = simulation.physics.model
+        return [model.id2name(i, "actuator") for i in range(model.nu)]
+    model = getattr(simulation, "model", None)
+    if not hasattr(model, "actuator"):
+        raise ValueError(f"{simulation} has no MuJoCo model, so its actuators have no names.")
+    return [model.actuator(i).name for i in range(model.nu)]
+
+
+def _build(task: Task, *, activations: bool, env_kwargs: dict[str, Any]) -> gym.Env:
+    env, faults = _simulator(task, env_kwargs)
+    if not isinstance(env.action_space, spaces.Box):
+        space = env.action_space
+        env.close()
+        raise ValueError(
+            f"{task.name} has the action space {space}; a synergy is a direction among "
+            "continuous actuators, so choose a task whose actions are a Box."
+        )
+    success_key = "solved" if task.solved else None
+    if task.solved is None:
+        success_key = _probe_success(env)
+    if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
+        env = FlattenObservation(env)
+    env = FiniteGuard(SinglePrecision(env), task.name, faults)
+    return NamedObservation(env, success_key, activations=activations)
+
+
+def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
+    """Builds the bare environment; also returns the exceptions by which it reports divergence."""
+    if task.suite == "dm_control":
+        suite = dm_control_suite()
+        from dm_control.rl.control import PhysicsError
+        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+
+        domain, task_name = task.env_id.split("-", 1)
+        env = suite.load(domain, task_name, **env_kwargs)
+        return DmControlCompatibilityV0(env), (PhysicsError,)
+    if task.suite == "myosuite":
+        import myosuite  # noqa: F401  (importing it registers its environments)
+    # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
+    return gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
+
+
+def _probe_success(env: gym.Env) -> str | None:
+    env.reset(seed=0)
+    info = env.step(env.action_space.sample())[-1]
+    return next((key for key in SUCCESS_KEYS if key in info), None)

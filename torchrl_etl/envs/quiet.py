@@ -1,0 +1,47 @@
+"""Silence for complaints of the simulators that a user can do nothing about, and for no others."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from types import ModuleType
+
+__all__ = ["dm_control_suite", "quiet_compiler"]
+
+_HARMLESS = (
+    "Attaching a spec with an empty prefix",  # MyoSuite's hands: matters for saving the model
+    "compiler attribute 'settotalmass' is deprecated",  # some of DMControl's models
+)
+
+
+@contextlib.contextmanager
+def quiet_compiler() -> Iterator[None]:
+    """While models are built, keeps MuJoCo's known complaints to itself.
+
+    MuJoCo otherwise writes its compiler's warnings to stderr and to a file in the working
+    directory. Unknown ones become Python warnings.
+    """
+    import mujoco
+
+    def report(message: str) -> None:
+        if not message.startswith(_HARMLESS):
+            warnings.warn(message, stacklevel=2)
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(report)
+    try:
+        with warnings.catch_warnings():
+            for message in _HARMLESS:
+                warnings.filterwarnings("ignore", message=message)
+            yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def dm_control_suite() -> ModuleType:
+    """Imports DMControl's suite, without its complaint that a machine has no screen."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing")
+        from dm_control import suite
+    return suite

@@ -1,0 +1,45 @@
+"""The simulator underneath an environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+from torchrl.envs import EnvBase, GymWrapper
+
+__all__ = ["mujoco_state", "simulator"]
+
+
+def simulator(env: EnvBase | gym.Env | gym.vector.VectorEnv) -> Any:
+    """The (first) simulator under transforms, wrappers and vectorisation.
+
+    Examples:
+        >>> from torchrl_etl.envs import make_env
+        >>> type(simulator(make_env("overactuated", num_envs=2))).__name__
+        'AnalyticOveractuated'
+    """
+    while not isinstance(env, gym.Env):
+        if isinstance(env, gym.vector.VectorEnv):
+            env = env.unwrapped.envs[0]
+        elif isinstance(env, GymWrapper):
+            env = env._env
+        elif hasattr(env, "base_env"):
+            env = env.base_env
+        else:
+            raise ValueError(f"There is no known way to the simulator of a {type(env).__name__}.")
+    return env.unwrapped
+
+
+def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
+    """MuJoCo's ``MjModel`` and ``MjData`` of an environment.
+
+    Raises:
+        ValueError: if the environment does not run on MuJoCo.
+    """
+    inner = simulator(env)
+    if hasattr(inner, "physics"):  # DMControl
+        return inner.physics.model.ptr, inner.physics.data.ptr
+    for model, data in (("mj_model", "mj_data"), ("model", "data")):
+        if hasattr(inner, model) and hasattr(inner, data):
+            return getattr(inner, model), getattr(inner, data)
+    raise ValueError(f"{type(inner).__name__} does not run on MuJoCo, so it cannot be drawn.")

@@ -1,0 +1,231 @@
+"""Task names: the paper's thirteen tasks, and what else :func:`make_env` accepts.
+
+Building nothing and importing no simulator for the thirteen, so that a name can be checked
+before workers start.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import gymnasium as gym
+
+from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
+
+__all__ = ["Task", "episode_length", "list_tasks", "resolve_task"]
+
+Goal = Literal["fixed", "random"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task: how to build it, and what its episodes are.
+
+    Attributes:
+        name: Short name, e.g. ``"myoHandPose"``; the environment id where there is none.
+        id: Environment id that is built for ``goal="fixed"``.
+        random_id: Environment id that is built for ``goal="random"``, if the task has one.
+        suite: ``"myosuite"``, ``"dm_control"`` or ``"gymnasium"``.
+        episode_steps: Number of steps after which an episode is truncated, ``None`` if it never is
+            (or, for DMControl domains outside the paper, not known before the task is built).
+        solved: Whether the task says when it is solved; ``None`` means that :func:`make_env`
+            finds out with one step.
+        goal: Which of the two goals is meant.
+
+    Examples:
+        >>> from torchrl_etl.envs import resolve_task
+        >>> resolve_task("myoHandPose", goal="random").env_id
+        'myoHandPoseRandom-v0'
+    """
+
+    name: str
+    id: str
+    random_id: str | None = None
+    suite: Literal["myosuite", "dm_control", "gymnasium"] = "gymnasium"
+    episode_steps: int | None = None
+    solved: bool | None = None
+    goal: Goal = "fixed"
+
+    @property
+    def env_id(self) -> str:
+        """The environment id of the chosen goal."""
+        return self.random_id if self.goal == "random" and self.random_id else self.id
+
+    @property
+    def goals(self) -> tuple[Goal, ...]:
+        """The goals that the task offers."""
+        return ("fixed", "random") if self.random_id else ("fixed",)
+
+
+def _hand(name: str, steps: int) -> Task:
+    return Task(name, f"{name}Fixed-v0", f"{name}Random-v0", "myosuite", steps, True)
+
+
+def _myo(name: str, env_id: str, steps: int) -> Task:
+    return Task(name, env_id, None, "myosuite", steps, True)
+
+
+def _dm_control(name: str) -> Task:
+    return Task(name, name, None, "dm_control", 1000, False)
+
+
+_PAPER = (
+    _hand("myoHandPose", 100),
+    _hand("myoHandKeyTurn", 200),
+    _hand("myoHandPenTwirl", 50),
+    _myo("myoBaoding", "myoChallengeBaodingP1-v1", 200),
+    _myo("myoDieReorient", "myoChallengeDieReorientP1-v0", 150),
+    _myo("myoRelocate", "myoChallengeRelocateP1-v0", 150),
+    _myo("myoLegWalk", "myoLegWalk-v0", 1000),
+    _myo("myoLegStairTerrainWalk", "myoLegStairTerrainWalk-v0", 1000),
+    _dm_control("humanoid-stand"),
+    _dm_control("humanoid-walk"),
+    _dm_control("humanoid-run"),
+    _dm_control("dog-walk"),
+    _dm_control("dog-run"),
+)
+
+_ANALYTIC = Task(
+    "overactuated",
+    "torchrl_etl/Overactuated-v0",
+    "torchrl_etl/OveractuatedRandom-v0",
+    "gymnasium",
+    25,
+    True,
+)
+
+_BY_NAME = {task.name: task for task in (*_PAPER, _ANALYTIC)}
+_BY_ID = {
+    env_id: replace(task, goal=goal)
+    for task in _BY_NAME.values()
+    if task.suite != "dm_control"
+    for goal, env_id in zip(("fixed", "random"), (task.id, task.random_id), strict=True)
+    if env_id is not None
+}
+
+_DM_CONTROL_NAME = re.compile(r"(\w+)-(?!v\d+$)(\w+)")
+
+
+def list_tasks() -> tuple[Task, ...]:
+    """Returns the paper's thirteen tasks, in the paper's groups: hand, leg, DMControl.
+
+    Examples:
+        >>> from torchrl_etl.envs import list_tasks
+        >>> len(list_tasks())
+        13
+        >>> [task.name for task in list_tasks() if "random" in task.goals]
+        ['myoHandPose', 'myoHandKeyTurn', 'myoHandPenTwirl']
+    """
+    return _PAPER
+
+
+def resolve_task(name: str, goal: Goal | None = None) -> Task:
+    """Finds the task that a name stands for, without building it.
+
+    Args:
+        name (str): a short name of :func:`list_tasks` or ``"overactuated"``; any environment id
+            registered with Gymnasium (MyoSuite's are registered on demand; ``"module:id"`` imports
+            ``module`` first); or any DMControl ``"domain-task"``, e.g. ``"cheetah-run"``.
+        goal (str, optional): ``"fixed"`` or ``"random"``. ``None`` (default) is the fixed goal for
+            a short name, and whatever the id says for an environment id.
+
+    Returns:
+        Task: the task, with ``goal`` filled in.
+
+    Raises:
+        ValueError: for an unknown name (with the nearest known ones), or a goal that the task does
+            not have.
+        ImportError: for ``"module:id"``, if there is no such module.
+
+    Examples:
+        >>> from torchrl_etl.envs import resolve_task
+        >>> resolve_task("myoBaoding").env_id
+        'myoChallengeBaodingP1-v1'
+        >>> resolve_task("myoBaoding", goal="random")
+        Traceback (most recent call last):
+        ...
+        ValueError: myoBaoding has no random goal; the tasks that have both goals are myoHandPose, \
+myoHandKeyTurn, myoHandPenTwirl, overactuated.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"A task is named by a string, got {type(name).__name__}.")
+    if goal not in (None, "fixed", "random"):
+        raise ValueError(f"goal must be 'fixed' or 'random', got {goal!r}.")
+    if name in _BY_NAME:
+        task = replace(_BY_NAME[name], goal=goal or "fixed")
+    elif name in _BY_ID:
+        task = _BY_ID[name]
+        if goal not in (None, task.goal):
+            raise ValueError(
+                f"{name} names its {task.goal} goal itself, but goal={goal!r} was asked for; "
+                f"leave goal out, or name the task {task.name!r}."
+            )
+    elif _in_dm_control(name):
+        task = Task(name, name, suite="dm_control", solved=False, goal=goal or "fixed")
+    elif _registered(name):
+        steps = gym.spec(name).max_episode_steps
+        task = Task(name, name, episode_steps=steps, goal=goal or "fixed")
+    else:
+        nearest = _nearest(name)
+        hint = f"the nearest known names are {', '.join(nearest)}" if nearest else "none is near it"
+        raise ValueError(
+            f"Unknown task {name!r}; {hint}. list_tasks() gives the paper's tasks; any "
+            "registered Gymnasium id and any DMControl 'domain-task' work too."
+        )
+    if task.goal == "random" and task.random_id is None:
+        both = ", ".join(t.name for t in _BY_NAME.values() if t.random_id)
+        raise ValueError(
+            f"{task.name} has no random goal; the tasks that have both goals are {both}."
+        )
+    return task
+
+
+def episode_length(name: str, goal: Goal | None = None) -> int | None:
+    """Returns the number of steps after which a task truncates an episode.
+
+    Args:
+        name (str): as for :func:`resolve_task`.
+        goal (str, optional): as for :func:`resolve_task`.
+
+    Returns:
+        int, optional: the number of steps, or ``None`` for a task without a limit. DMControl
+        tasks outside the paper are built to find it.
+
+    Examples:
+        >>> from torchrl_etl.envs import episode_length
+        >>> episode_length("myoHandPenTwirl"), episode_length("dog-run")
+        (50, 1000)
+    """
+    task = resolve_task(name, goal)
+    if task.suite == "dm_control" and task.episode_steps is None:
+        with quiet_compiler():
+            env = dm_control_suite().load(*task.id.split("-", 1))
+        limit = env._step_limit  # in control steps; nothing public holds it
+        return None if limit == float("inf") else int(limit)
+    return task.episode_steps
+
+
+def _in_dm_control(name: str) -> bool:
+    match = _DM_CONTROL_NAME.fullmatch(name)
+    return match is not None and match.groups() in dm_control_suite().ALL_TASKS
+
+
+def _registered(name: str) -> bool:
+    module, _, env_id = name.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    if env_id not in gym.registry:
+        import myosuite  # noqa: F401  (importing it registers its environments)
+    return env_id in gym.registry
+
+
+def _nearest(name: str, count: int = 5) -> list[str]:
+    suite_names = ("-".join(pair) for pair in dm_control_suite().ALL_TASKS)
+    known = [*_BY_NAME, *gym.registry, *suite_names]
+    lowered = {candidate.lower(): candidate for candidate in reversed(known)}
+    found = difflib.get_close_matches(name.lower(), lowered, n=count, cutoff=0.5)
+    return [lowered[candidate] for candidate in found]

@@ -1,0 +1,209 @@
+"""Small Gymnasium wrappers between a simulator and TorchRL's ``GymWrapper``.
+
+What TorchRL should see goes through the *observation*, not through ``info``: a dict observation is
+declared in the specs, survives partial resets, and is batched by Gymnasium's vector environments
+without any per-key work, while ``info`` has none of these.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+__all__ = [
+    "SUCCESS_KEYS",
+    "FiniteGuard",
+    "NamedObservation",
+    "SeededVectorEnv",
+    "SimulationError",
+    "SinglePrecision",
+]
+
+SUCCESS_KEYS = ("solved", "is_success", "success")
+"""Entries of ``info`` that mean success, in order of preference."""
+
+
+class SimulationError(RuntimeError):
+    """A simulation left the real numbers: an observation, a reward or an action is not finite."""
+
+
+class SinglePrecision(gym.Wrapper):
+    """Observations and actions in float32, whatever the simulator computes in."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.observation_space = _as_float32(env.observation_space)
+        self.action_space = _as_float32(env.action_space)
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = self.env.reset(**kwargs)
+        return np.asarray(observation, dtype=np.float32), info
+
+    def step(self, action: np.ndarray):
+        observation, *rest = self.env.step(action)
+        # A value beyond float32 becomes infinite here; the guard, not NumPy, speaks about it.
+        with np.errstate(over="ignore"):
+            return np.asarray(observation, dtype=np.float32), *rest
+
+
+class FiniteGuard(gym.Wrapper):
+    """Stops at the first action, observation or reward that is not finite.
+
+    Args:
+        env (gym.Env): an environment with an array as observation.
+        name (str): the task's name, for the message.
+        faults (tuple of exception types): exceptions by which the simulator itself reports that it
+            diverged.
+
+    Raises:
+        SimulationError: saying which entries, in which episode and at which step.
+    """
+
+    def __init__(self, env: gym.Env, name: str, faults: tuple[type[Exception], ...] = ()):
+        super().__init__(env)
+        self._name = name
+        self._faults = faults
+        self._seed: int | None = None
+        self._episode = 0
+        self._step = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        if seed is not None:
+            self._seed, self._episode = seed, 0
+        self._episode += 1
+        self._step = 0
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._check("observation", observation)
+        return observation, info
+
+    def step(self, action: np.ndarray):
+        self._step += 1
+        self._check("action", action, "the policy sent it: look for a diverged loss or network")
+        try:
+            result = self.env.step(action)
+        except self._faults as fault:
+            raise self._error(f"simulator diverged ({fault})") from fault
+        self._check("observation", result[0])
+        self._check("reward", result[1])
+        return result
+
+    def _check(self, what: str, value: Any, cure: str | None = None) -> None:
+        bad = np.flatnonzero(~np.isfinite(value))
+        if bad.size:
+            shown = ", ".join(map(str, bad[:8])) + (", ..." if bad.size > 8 else "")
+            where = "" if np.ndim(value) == 0 else f" (entries {shown} of {np.size(value)})"
+            raise self._error(f"{what} is not finite{where}", cure)
+
+    def _error(self, what: str, cure: str | None = None) -> SimulationError:
+        seed = "never seeded" if self._seed is None else f"since seed {self._seed}"
+        cure = cure or (
+            "if it is rare, resume from a checkpoint with another seed, "
+            "otherwise make the actions smaller or smoother"
+        )
+        return SimulationError(
+            f"{self._name}: the {what} at step {self._step} of episode {self._episode} ({seed}); "
+            f"{cure}."
+        )
+
+
+class NamedObservation(gym.Wrapper):
+    """Turns an array observation into ``{"observation": ..., "solved": ..., "activation": ...}``.
+
+    ``info`` is dropped: MyoSuite's nested dicts are slow to batch, and nothing downstream reads it.
+
+    Args:
+        env (gym.Env): an environment with an array as observation.
+        success_key (str, optional): the entry of ``info`` that becomes ``solved``, a boolean of
+            shape [1] that is ``False`` at reset. ``None`` means that there is no such entry.
+        activations (bool): whether to add ``activation``, the muscle activations in the units of
+            the action, shape [n] (MyoSuite tasks only).
+
+    Equation:
+        MyoSuite's hand and arm tasks excite a muscle by :math:`u = \\sigma(5(a - 1/2))`, so an
+        activation :math:`x` is worth the action :math:`a = 1/2 + \\ln(x / (1 - x)) / 5`, clipped to
+        the action's bounds. Its leg tasks take excitations as actions, so there
+        :math:`a = x`.
+
+    Raises:
+        ValueError: when ``activations`` is asked of an environment without muscles.
+    """
+
+    def __init__(self, env: gym.Env, success_key: str | None = None, *, activations: bool = False):
+        super().__init__(env)
+        self._success_key = success_key
+        self._activations = activations
+        entries: dict[str, spaces.Space] = {"observation": env.observation_space}
+        if success_key is not None:
+            entries["solved"] = spaces.Box(0, 1, (1,), np.bool_)
+        if activations:
+            self._sigmoid = _sends_sigmoid(env)
+            entries["activation"] = env.action_space
+        self.observation_space = spaces.Dict(entries)
+
+    def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        observation, _ = self.env.reset(**kwargs)
+        return self._name_parts(observation, False), {}
+
+    def step(self, action: np.ndarray):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        solved = bool(np.any(info.get(self._success_key, False)))
+        return self._name_parts(observation, solved), reward, terminated, truncated, {}
+
+    def _name_parts(self, observation: np.ndarray, solved: bool) -> dict[str, np.ndarray]:
+        parts = {"observation": observation}
+        if self._success_key is not None:
+            parts["solved"] = np.array([solved])
+        if self._activations:
+            parts["activation"] = self._activation()
+        return parts
+
+    def _activation(self) -> np.ndarray:
+        simulation = self.unwrapped
+        activation = simulation.data.act[simulation.model.actuator_actadr]
+        if self._sigmoid:
+            # Muscles rest at exactly zero after a reset: minus infinity, then the lower bound.
+            with np.errstate(divide="ignore"):
+                activation = 0.5 + np.log(activation / (1.0 - activation)) / 5.0
+        bounds = self.action_space
+        return np.clip(activation, bounds.low, bounds.high).astype(np.float32)
+
+
+class SeededVectorEnv(SyncVectorEnv):
+    """Steps copies of an environment in turn; one seed gives each copy its own.
+
+    The first copy gets the seed itself, so it repeats what a single environment does. The others
+    get statistically independent ones: Gymnasium's ``seed + i`` would make the copies of one worker
+    repeat those of another whose seed is a little larger.
+    """
+
+    def __init__(self, env_fns):
+        # TorchRL resets what is done, itself.
+        super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
+        if isinstance(seed, (int, np.integer)):
+            others = np.random.SeedSequence(int(seed)).generate_state(self.num_envs - 1)
+            seed = [int(seed), *map(int, others)]
+        return super().reset(seed=seed, options=options)
+
+
+def _as_float32(space: spaces.Box) -> spaces.Box:
+    with np.errstate(over="ignore"):
+        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def _sends_sigmoid(env: gym.Env) -> bool:
+    """Whether the environment maps actions to muscle excitations through MyoSuite's sigmoid."""
+    simulation, bounds = env.unwrapped, env.action_space
+    model = getattr(simulation, "model", None)
+    if not hasattr(simulation, "normalize_act") or model is None or model.na != model.nu:
+        raise ValueError(
+            f"activations=True needs a MyoSuite task all of whose actuators are muscles, "
+            f"got {simulation}; leave it out."
+        )
+    return bool(simulation.normalize_act and np.all(bounds.low == -1) and np.all(bounds.high == 1))

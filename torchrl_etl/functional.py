@@ -1,0 +1,563 @@
+"""Equations 1-10 of Explore to Learn as pure tensor functions.
+
+No keys, no modules, no state: tensors in, tensors out. Every function works on any number of
+leading batch dimensions (written ``*``), and none of them reduces over the batch: that is left to
+the caller. Symbols: ``n`` actuators, ``d`` synergies, ``k`` embedding dimensions, ``C`` mixture
+components.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "GMVAEBound",
+    "categorical_kl",
+    "direction_bonus",
+    "discriminability",
+    "effective_rank",
+    "encoder_loss",
+    "expected_distance",
+    "gaussian_kl",
+    "gaussian_log_prob",
+    "gaussian_w2",
+    "gmvae_bound",
+    "l2_distance",
+    "metric_loss",
+    "metric_target",
+    "mico_distance",
+    "mixture_log_prob",
+    "reconstruction_loss",
+]
+
+# Inside a square root: small enough not to be seen in float32 distances, large enough that the
+# gradient of the root at zero is zero instead of NaN.
+EPS = 1e-12
+
+
+# ---------------------------------------------------------------------------------------------
+# Latent exploration: Eqs. 1-6
+# ---------------------------------------------------------------------------------------------
+
+
+def direction_bonus(embedding: Tensor, next_embedding: Tensor, direction: Tensor) -> Tensor:
+    r"""Exploration bonus: how far a transition moved along the direction in embedding space.
+
+    .. math:: r^b(s, s', z) = \langle \phi(s') - \phi(s), z \rangle
+
+    Args:
+        embedding (Tensor): :math:`\phi(s)`, ``[*, k]``.
+        next_embedding (Tensor): :math:`\phi(s')`, ``[*, k]``.
+        direction (Tensor): unit vector :math:`z_{sp}`, ``[*, k]``.
+
+    Returns:
+        Tensor: the bonus, ``[*, 1]`` like every reward in TorchRL.
+
+    Equation: 1
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import direction_bonus
+        >>> direction_bonus(
+        ...     torch.tensor([1.0, 2.0]), torch.tensor([4.0, 1.0]), torch.tensor([0.6, 0.8])
+        ... )
+        tensor([1.])
+    """
+    return ((next_embedding - embedding) * direction).sum(-1, keepdim=True)
+
+
+def l2_distance(x: Tensor, y: Tensor, eps: float = EPS) -> Tensor:
+    r"""Euclidean distance :math:`d` between embeddings, differentiable where they coincide.
+
+    Args:
+        x (Tensor): embeddings, ``[*, k]``.
+        y (Tensor): embeddings, ``[*, k]``.
+        eps (float, optional): added inside the root, so that the gradient at ``x == y`` is zero
+            and not NaN; the distance there reads ``eps ** 0.5``. Defaults to ``1e-12``.
+
+    Returns:
+        Tensor: distances, ``[*]``.
+
+    Equation: 2 (the metric ``d``)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import l2_distance
+        >>> l2_distance(torch.tensor([0.0, 0.0]), torch.tensor([3.0, 4.0]))
+        tensor(5.)
+    """
+    return ((x - y).square().sum(-1) + eps).sqrt()
+
+
+def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> Tensor:
+    r"""MICo's diffuse distance: mean squared norm plus a weighted angle.
+
+    .. math:: U(x, y) = \tfrac12 (\|x\|^2 + \|y\|^2) + \beta\,\angle(x, y)
+
+    A state's distance to itself is :math:`\|x\|^2`, not zero: this is a *diffuse* metric, made for
+    a divergence estimated from independent samples, whose value for a state paired with itself is
+    not zero either.
+
+    Args:
+        x (Tensor): embeddings, ``[*, k]``.
+        y (Tensor): embeddings, ``[*, k]``.
+        beta (float, optional): weight of the angle (radians). Defaults to ``0.1``.
+        eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
+
+    Returns:
+        Tensor: distances, ``[*]``.
+
+    Equation: 2 (the metric ``d``, MICo's reading)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import mico_distance
+        >>> mico_distance(torch.tensor([2.0, 0.0]), torch.tensor([0.0, 4.0]))  # 10 + 0.1 * pi / 2
+        tensor(10.1571)
+    """
+    x_square, y_square = x.square().sum(-1), y.square().sum(-1)
+    x_unit = x / (x_square + eps).sqrt().unsqueeze(-1)
+    y_unit = y / (y_square + eps).sqrt().unsqueeze(-1)
+    # Half-angle form: accurate, and finite in its gradient, at 0 and at pi where arccos is not.
+    angle = 2 * torch.atan2(l2_distance(x_unit, y_unit, eps), l2_distance(x_unit, -y_unit, eps))
+    return 0.5 * (x_square + y_square) + beta * angle
+
+
+def gaussian_w2(
+    mean_i: Tensor, std_i: Tensor, mean_j: Tensor, std_j: Tensor, eps: float = EPS
+) -> Tensor:
+    r"""2-Wasserstein distance between two diagonal Gaussians, the divergence of DBC.
+
+    .. math:: W_2 = \sqrt{\|\mu_i - \mu_j\|^2 + \|\sigma_i - \sigma_j\|^2}
+
+    Args:
+        mean_i (Tensor): mean of the first, ``[*, k]``.
+        std_i (Tensor): standard deviation of the first, ``[*, k]``.
+        mean_j (Tensor): mean of the second, ``[*, k]``.
+        std_j (Tensor): standard deviation of the second, ``[*, k]``.
+        eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
+
+    Returns:
+        Tensor: distances, ``[*]``.
+
+    Equation: 2 (the divergence ``D``, DBC's reading)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import gaussian_w2
+        >>> gaussian_w2(
+        ...     torch.tensor([0.0]), torch.tensor([1.0]), torch.tensor([3.0]), torch.tensor([5.0])
+        ... )
+        tensor(5.)
+    """
+    return ((mean_i - mean_j).square().sum(-1) + (std_i - std_j).square().sum(-1) + eps).sqrt()
+
+
+def metric_target(reward_i: Tensor, reward_j: Tensor, divergence: Tensor, gamma: float) -> Tensor:
+    r"""The behavioral-metric operator applied to one pair of states.
+
+    .. math:: \mathcal F^\pi(d)(s_i, s_j) = |r_i - r_j| + \gamma\,\mathcal D(d; P_i, P_j)
+
+    Args:
+        reward_i (Tensor): rewards of the first states, ``[*]``.
+        reward_j (Tensor): rewards of the second states, ``[*]``.
+        divergence (Tensor): distance between what follows, ``[*]``. A loss passes it detached.
+        gamma (float): discount factor.
+
+    Returns:
+        Tensor: target distances, ``[*]``.
+
+    Equation: 2
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import metric_target
+        >>> metric_target(torch.tensor(1.0), torch.tensor(3.0), torch.tensor(10.0), 0.9)
+        tensor(11.)
+    """
+    return (reward_i - reward_j).abs() + gamma * divergence
+
+
+def metric_loss(distance: Tensor, target: Tensor) -> Tensor:
+    r"""Half squared error between the latent distance and its target, not reduced.
+
+    Args:
+        distance (Tensor): :math:`d_\phi(s_i, s_j)`, ``[*]``.
+        target (Tensor): :func:`metric_target`, ``[*]``.
+
+    Returns:
+        Tensor: losses, ``[*]``.
+
+    Equation: 3 (its expectation is taken by the caller)
+
+    Deviates: as printed the difference is squared outside the expectation; the square belongs
+        inside, as Eq. 6 has it.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import metric_loss
+        >>> metric_loss(torch.tensor(5.0), torch.tensor(2.0))
+        tensor(4.5000)
+    """
+    return 0.5 * (distance - target).square()
+
+
+def expected_distance(mean_abs_reward_difference: Tensor | float, gamma: float) -> Tensor | float:
+    r"""Mean distance that Theorem 1 predicts for a converged behavioral metric.
+
+    .. math:: \mathbb E[d] = \mathbb E|r_i - r_j| / (1 - \gamma)
+
+    It holds for deterministic transitions when a pair and its successor pair have the same
+    distribution. A mean reward difference near zero therefore means a collapsed embedding.
+
+    Args:
+        mean_abs_reward_difference (Tensor or float): :math:`\mathbb E|r_i - r_j|`.
+        gamma (float): discount factor in ``[0, 1)``.
+
+    Returns:
+        Tensor or float: the predicted mean distance.
+
+    Raises:
+        ValueError: if ``gamma`` is outside ``[0, 1)``.
+
+    Equation: 4
+
+    Examples:
+        >>> from torchrl_etl.functional import expected_distance
+        >>> round(expected_distance(0.5, 0.9), 6)
+        5.0
+    """
+    if not 0.0 <= gamma < 1.0:
+        raise ValueError(f"gamma must be in [0, 1) for the series to converge, got {gamma}.")
+    return mean_abs_reward_difference / (1.0 - gamma)
+
+
+def discriminability(
+    reward_i: Tensor,
+    reward_j: Tensor,
+    embedding_i: Tensor,
+    embedding_j: Tensor,
+    epsilon: float,
+    margin: float = 1.0,
+    form: Literal["hinge", "literal"] = "hinge",
+) -> Tensor:
+    r"""Behavioral discriminability regularization of a pair of states.
+
+    - ``"hinge"``: :math:`1[|r_i-r_j|<\epsilon]\;\max(0,\, m-\|\phi_i-\phi_j\|)^2`
+    - ``"literal"``: :math:`1[|r_i-r_j|<\epsilon]\;\|\phi_i-\phi_j\|^2`
+
+    Args:
+        reward_i (Tensor): rewards of the first states, ``[*]``.
+        reward_j (Tensor): rewards of the second states, ``[*]``.
+        embedding_i (Tensor): embeddings of the first states, ``[*, k]``.
+        embedding_j (Tensor): embeddings of the second states, ``[*, k]``.
+        epsilon (float): pairs whose rewards differ by less than this are regularized.
+        margin (float, optional): distance beyond which the hinge is silent; not read by
+            ``"literal"``. Defaults to ``1.0``.
+        form (str, optional): ``"hinge"`` or ``"literal"``. Defaults to ``"hinge"``.
+
+    Returns:
+        Tensor: penalties to *minimize*, ``[*]``.
+
+    Raises:
+        ValueError: if ``form`` is unknown.
+
+    Equation: 5
+
+    Deviates: the printed term (``"literal"``) is added to a minimized loss, so it *contracts* the
+        very pairs it is said to keep apart: with equal rewards and a fixed next-state distance
+        ``d'`` the minimum of Eq. 6 is at :math:`d = \gamma d' / (1 + 2\lambda)`, below the metric's
+        own :math:`\gamma d'`, and its fixed point is collapse. The hinge pushes such pairs apart
+        until they are ``margin`` away from each other and then leaves them to the metric.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import discriminability
+        >>> pair = torch.tensor([0.0, 0.0]), torch.tensor([0.6, 0.8])
+        >>> same = torch.tensor(0.0), torch.tensor(0.01)
+        >>> discriminability(*same, *pair, epsilon=0.05, margin=3.0)
+        tensor(4.)
+        >>> discriminability(*same, *pair, epsilon=0.05, form="literal")
+        tensor(1.)
+        >>> discriminability(*same, *pair, epsilon=0.005)
+        tensor(0.)
+    """
+    if form == "hinge":
+        penalty = (margin - l2_distance(embedding_i, embedding_j)).clamp_min(0.0).square()
+    elif form == "literal":
+        penalty = (embedding_i - embedding_j).square().sum(-1)
+    else:
+        raise ValueError(f"form must be 'hinge' or 'literal', got {form!r}.")
+    alike = (reward_i - reward_j).abs() < epsilon
+    return torch.where(alike, penalty, torch.zeros_like(penalty))
+
+
+def encoder_loss(metric: Tensor, regularizer: Tensor, weight: float) -> Tensor:
+    r"""The state encoder's whole objective: metric loss plus weighted regularizer.
+
+    Args:
+        metric (Tensor): :func:`metric_loss`, ``[*]``.
+        regularizer (Tensor): :func:`discriminability`, ``[*]``.
+        weight (float): :math:`\lambda`.
+
+    Returns:
+        Tensor: losses, ``[*]``.
+
+    Equation: 6
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import encoder_loss
+        >>> encoder_loss(torch.tensor(2.0), torch.tensor(4.0), 0.5)
+        tensor(4.)
+    """
+    return metric + weight * regularizer
+
+
+def effective_rank(embedding: Tensor) -> Tensor:
+    r"""Number of embedding dimensions in real use: exponential of the singular values' entropy.
+
+    Not in the paper; a collapsed encoder shows here before it shows in the return. It measures
+    shape and not size, so read it beside the mean distance.
+
+    Args:
+        embedding (Tensor): embeddings, ``[*, k]``; all leading dimensions count as samples.
+
+    Returns:
+        Tensor: a scalar in ``[1, k]``, or ``0`` where the embedding is constant.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import effective_rank
+        >>> cross = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1, 0]])
+        >>> round(effective_rank(cross).item(), 4)  # two of three dimensions
+        2.0
+        >>> effective_rank(torch.ones(4, 3))
+        tensor(0.)
+    """
+    flat = embedding.reshape(-1, embedding.shape[-1])
+    values = torch.linalg.svdvals(flat - flat.mean(0))
+    total = values.sum()
+    entropy = torch.special.entr(values / total.clamp_min(EPS)).sum()
+    return torch.where(total > EPS, entropy.exp(), torch.zeros_like(total))
+
+
+# ---------------------------------------------------------------------------------------------
+# Synergy representation: Eqs. 7-10
+# ---------------------------------------------------------------------------------------------
+
+
+def gaussian_log_prob(value: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+    r"""Log-density of a diagonal Gaussian, summed over the last dimension.
+
+    Args:
+        value (Tensor): points, ``[*, n]``.
+        loc (Tensor): means, ``[*, n]``.
+        scale (Tensor): standard deviations, broadcastable to ``[*, n]``.
+
+    Returns:
+        Tensor: log-densities, ``[*]``.
+
+    Equation: 7 (:math:`p(z|c)`) and 9 (:math:`p(a|z)`)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import gaussian_log_prob
+        >>> gaussian_log_prob(torch.zeros(2), torch.zeros(2), torch.ones(2))  # -log(2 pi)
+        tensor(-1.8379)
+    """
+    standardized = (value - loc) / scale
+    return -(0.5 * standardized.square() + scale.log() + 0.5 * math.log(2 * math.pi)).sum(-1)
+
+
+def gaussian_kl(loc_q: Tensor, scale_q: Tensor, loc_p: Tensor, scale_p: Tensor) -> Tensor:
+    r"""Closed-form :math:`\mathrm{KL}(q \| p)` of diagonal Gaussians, summed over dimensions.
+
+    Args:
+        loc_q (Tensor): means of ``q``, ``[*, d]``.
+        scale_q (Tensor): standard deviations of ``q``, ``[*, d]``.
+        loc_p (Tensor): means of ``p``, broadcastable to ``[*, d]``.
+        scale_p (Tensor): standard deviations of ``p``, broadcastable to ``[*, d]``.
+
+    Returns:
+        Tensor: divergences in nats, ``[*]``.
+
+    Equation: 9 (:math:`\mathrm{KL}(q(z|a,c) \| p(z|c))`)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import gaussian_kl
+        >>> one = torch.ones(1)
+        >>> gaussian_kl(2 * one, one, 0 * one, one)
+        tensor(2.)
+    """
+    ratio = scale_q / scale_p
+    shift = (loc_q - loc_p) / scale_p
+    return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)
+
+
+def categorical_kl(logits: Tensor, prior_logits: Tensor | None = None) -> Tensor:
+    r""":math:`\mathrm{KL}(q(c) \| p(c))` of categorical distributions given by their logits.
+
+    Args:
+        logits (Tensor): logits of ``q``, ``[*, C]``.
+        prior_logits (Tensor, optional): logits of ``p``, broadcastable to ``[*, C]``. ``None``
+            is the fixed uniform prior of the paper. Defaults to ``None``.
+
+    Returns:
+        Tensor: divergences in nats, ``[*]``; zero for a single component.
+
+    Equation: 9 (:math:`\mathrm{KL}(q(c|a) \| p(c))`)
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import categorical_kl
+        >>> categorical_kl(torch.tensor([100.0, 0.0]))  # log 2
+        tensor(0.6931)
+    """
+    log_q = logits.log_softmax(-1)
+    log_p = _component_log_prior(logits, prior_logits)
+    return (log_q.exp() * (log_q - log_p)).sum(-1)
+
+
+def mixture_log_prob(z: Tensor, loc: Tensor, scale: Tensor, logits: Tensor | None = None) -> Tensor:
+    r"""Log-density of the Gaussian-mixture prior over synergy coefficients.
+
+    .. math:: p(z) = \sum_c P_c\, \mathcal N(z; \mu_c, \Sigma_c)
+
+    Args:
+        z (Tensor): synergy coefficients, ``[*, d]``.
+        loc (Tensor): component means, ``[C, d]``.
+        scale (Tensor): component standard deviations, ``[C, d]``.
+        logits (Tensor, optional): logits of :math:`P`, ``[C]``. ``None`` is the fixed uniform
+            prior of the paper. Defaults to ``None``.
+
+    Returns:
+        Tensor: log-densities, ``[*]``.
+
+    Equation: 7 (the summands) and 8
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import mixture_log_prob
+        >>> loc, scale = torch.tensor([[-1.0], [1.0]]), torch.ones(2, 1)
+        >>> mixture_log_prob(torch.zeros(1), loc, scale)  # -0.5 - log(2 pi) / 2
+        tensor(-1.4189)
+    """
+    per_component = gaussian_log_prob(z.unsqueeze(-2), loc, scale)
+    return (per_component + _component_log_prior(per_component, logits)).logsumexp(-1)
+
+
+class GMVAEBound(NamedTuple):
+    """The lower bound of Eq. 9 and its three terms, each ``[*]`` and in nats.
+
+    Attributes:
+        bound: ``reconstruction - latent_kl - component_kl``, to be maximized.
+        reconstruction: expected log-likelihood of the action.
+        latent_kl: expected divergence of ``q(z|a,c)`` from ``p(z|c)``.
+        component_kl: divergence of ``q(c|a)`` from ``p(c)``.
+    """
+
+    bound: Tensor
+    reconstruction: Tensor
+    latent_kl: Tensor
+    component_kl: Tensor
+
+
+def gmvae_bound(
+    action: Tensor,
+    decoded: Tensor,
+    likelihood_scale: Tensor,
+    logits: Tensor,
+    loc: Tensor,
+    scale: Tensor,
+    prior_loc: Tensor,
+    prior_scale: Tensor,
+    prior_logits: Tensor | None = None,
+) -> GMVAEBound:
+    r"""Variational lower bound of the Gaussian-mixture VAE, per sample.
+
+    .. math::
+        \mathcal L(a) = \sum_c q(c|a) \big[ \log p(a|z_c)
+            - \mathrm{KL}(q(z|a,c) \| p(z|c)) \big] - \mathrm{KL}(q(c|a) \| p(c)),
+        \qquad z_c \sim q(z|a,c)
+
+    With one component the last term is zero and the rest is the bound of an ordinary VAE.
+
+    Args:
+        action (Tensor): actions, ``[*, n]``.
+        decoded (Tensor): means of :math:`p(a|z_c)`, decoded from one reparameterized sample
+            :math:`z_c` of every component, ``[*, C, n]``.
+        likelihood_scale (Tensor): standard deviation of :math:`p(a|z)`, broadcastable to
+            ``[*, C, n]``.
+        logits (Tensor): logits of :math:`q(c|a)`, ``[*, C]``.
+        loc (Tensor): means of :math:`q(z|a,c)`, ``[*, C, d]``.
+        scale (Tensor): standard deviations of :math:`q(z|a,c)`, ``[*, C, d]``.
+        prior_loc (Tensor): :math:`\mu_c`, ``[C, d]``.
+        prior_scale (Tensor): square roots of the diagonal of :math:`\Sigma_c`, ``[C, d]``.
+        prior_logits (Tensor, optional): logits of :math:`p(c)`, ``[C]``; ``None`` is uniform.
+
+    Returns:
+        GMVAEBound: the bound and its three terms, each ``[*]``.
+
+    Equation: 9
+
+    Deviates: the expectation over ``c`` is summed exactly (the paper does not say how it is
+        taken); with a handful of components that is cheap and has no sampling noise.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import gmvae_bound
+        >>> action, decoded = torch.zeros(1), torch.tensor([[0.0], [1.0]])
+        >>> terms = gmvae_bound(
+        ...     action, decoded, torch.ones(1), torch.zeros(2),
+        ...     torch.zeros(2, 1), torch.ones(2, 1), torch.tensor([[0.0], [2.0]]), torch.ones(2, 1),
+        ... )
+        >>> terms.latent_kl  # (0 + 2) / 2
+        tensor(1.)
+        >>> terms.component_kl
+        tensor(0.)
+        >>> terms.bound  # -(0 + 1/2) / 2 - log(2 pi) / 2 - 1
+        tensor(-2.1689)
+    """
+    probability = logits.softmax(-1)
+    log_likelihood = gaussian_log_prob(action.unsqueeze(-2), decoded, likelihood_scale)
+    reconstruction = (probability * log_likelihood).sum(-1)
+    latent_kl = (probability * gaussian_kl(loc, scale, prior_loc, prior_scale)).sum(-1)
+    component_kl = categorical_kl(logits, prior_logits)
+    bound = reconstruction - latent_kl - component_kl
+    return GMVAEBound(bound, reconstruction, latent_kl, component_kl)
+
+
+def reconstruction_loss(decoded: Tensor, action: Tensor) -> Tensor:
+    r"""Squared error between a decoded synergy and the action it stood for.
+
+    .. math:: |\mathrm{Dec}(z) - a|^2
+
+    Args:
+        decoded (Tensor): :math:`\mathrm{Dec}(z)`, ``[*, n]``.
+        action (Tensor): recorded actions, ``[*, n]``.
+
+    Returns:
+        Tensor: squared errors summed over actuators, ``[*]``.
+
+    Equation: 10
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.functional import reconstruction_loss
+        >>> reconstruction_loss(torch.tensor([1.0, 2.0]), torch.tensor([0.0, 0.0]))
+        tensor(5.)
+    """
+    return (decoded - action).square().sum(-1)
+
+
+def _component_log_prior(like: Tensor, logits: Tensor | None) -> Tensor:
+    """Log-probabilities of the components: uniform over ``like``'s last dimension by default."""
+    if logits is None:
+        return like.new_full((), -math.log(like.shape[-1]))
+    return logits.log_softmax(-1)

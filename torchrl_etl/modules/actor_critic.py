@@ -1,0 +1,93 @@
+"""Actor and critic bodies shared by both stages and by plain SAC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from tensordict.nn import InteractionType, TensorDictModule, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.data.tensor_specs import TensorSpec
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+
+__all__ = ["make_actor", "make_critic"]
+
+
+def _body(in_features: int, out_features: int, hidden: Sequence[int], layer_norm: bool) -> MLP:
+    return MLP(
+        in_features,
+        out_features,
+        num_cells=list(hidden),
+        activation_class=nn.ReLU,
+        norm_class=nn.LayerNorm if layer_norm else None,
+        norm_kwargs=[{"normalized_shape": width} for width in hidden] if layer_norm else None,
+    )
+
+
+def make_actor(
+    inputs: Mapping[NestedKey, int],
+    action_spec: TensorSpec,
+    *,
+    out_key: NestedKey = "action",
+    hidden: Sequence[int] = (256, 256),
+    layer_norm: bool = True,
+) -> ProbabilisticActor:
+    """Tanh-Gaussian actor whose samples fill the bounds of ``action_spec``.
+
+    Args:
+        inputs (mapping of NestedKey to int): keys that the actor reads, with their sizes; several
+            keys are concatenated.
+        action_spec (TensorSpec): one unbatched bounded leaf.
+
+    Keyword Args:
+        out_key (NestedKey): where the sample goes. Default: ``"action"``.
+        hidden (sequence of int): widths of the hidden layers.
+        layer_norm (bool): normalise each hidden layer.
+
+    Keys:
+        reads ``inputs``; writes ``loc``, ``scale`` [*, n] (before the tanh) and ``out_key`` [*, n].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> actor = make_actor({"observation": 7, "direction": 4}, Bounded(0, 1, shape=(80,)))
+        >>> entries = {"observation": torch.randn(3, 7), "direction": torch.randn(3, 4)}
+        >>> action = actor(TensorDict(entries, [3]))["action"]
+        >>> action.shape, bool((action >= 0).all())
+        (torch.Size([3, 80]), True)
+    """
+    body = _body(sum(inputs.values()), 2 * action_spec.shape[-1], hidden, layer_norm)
+    extractor = NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3)
+    return ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(body, in_keys=list(inputs), out_keys=["normal_params"]),
+            TensorDictModule(extractor, in_keys=["normal_params"], out_keys=["loc", "scale"]),
+            selected_out_keys=["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"],
+        out_keys=[out_key],
+        spec=action_spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
+        default_interaction_type=InteractionType.RANDOM,
+    )
+
+
+def make_critic(
+    inputs: Mapping[NestedKey, int],
+    *,
+    hidden: Sequence[int] = (256, 256),
+    layer_norm: bool = True,
+) -> ValueOperator:
+    """Q-network on the concatenation of ``inputs``; writes ``state_action_value`` [*, 1].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> critic = make_critic({"observation": 7, "action": 5})
+        >>> data = TensorDict({"observation": torch.randn(3, 7), "action": torch.randn(3, 5)}, [3])
+        >>> critic(data)["state_action_value"].shape
+        torch.Size([3, 1])
+    """
+    return ValueOperator(_body(sum(inputs.values()), 1, hidden, layer_norm), in_keys=list(inputs))

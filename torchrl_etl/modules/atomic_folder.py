@@ -1,0 +1,84 @@
+"""Replace a folder of files so that a crash leaves the old one or the new one, never a mixture."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+__all__ = ["replace_folder", "surviving_folder"]
+
+
+def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Make ``folder`` hold exactly ``files``; whatever it held before is removed.
+
+    The files are written to a hidden sibling and flushed to disk. No call that works everywhere
+    exchanges two folders, so the old one first steps aside under a hidden name; until the new one
+    has its place, :func:`surviving_folder` finds the old one there. One process at a time may
+    write to a folder.
+
+    Args:
+        folder (Path): where the files belong; parents are created.
+        files (mapping of str to bytes): names and contents.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as parent:
+        ...     folder = Path(parent) / "bundle"
+        ...     replace_folder(folder, {"old": b"1"})
+        ...     replace_folder(folder, {"new": b"2"})
+        ...     [path.name for path in folder.iterdir()], len(list(Path(parent).iterdir()))
+        (['new'], 1)
+    """
+    parent, aside = folder.parent, _aside(folder)
+    parent.mkdir(parents=True, exist_ok=True)
+    if aside.exists() and not folder.exists():  # a crash came between the two moves below
+        os.replace(aside, folder)
+    for stale in parent.glob(f".{folder.name}.saving-*"):
+        shutil.rmtree(stale, ignore_errors=True)
+    fresh = folder.with_name(f".{folder.name}.saving-{os.getpid()}")
+    try:
+        fresh.mkdir()
+        for name, content in files.items():
+            with open(fresh / name, "xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        _flush(fresh)
+        if folder.exists():
+            shutil.rmtree(aside, ignore_errors=True)
+            os.replace(folder, aside)
+        try:
+            os.replace(fresh, folder)
+        except BaseException:
+            if aside.exists():
+                os.replace(aside, folder)
+            raise
+        _flush(parent)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def surviving_folder(folder: Path) -> Path:
+    """Where the content of ``folder`` is: there, or aside if a replacement was cut short.
+
+    Examples:
+        >>> surviving_folder(Path("nowhere"))
+        PosixPath('nowhere')
+    """
+    return _aside(folder) if _aside(folder).exists() and not folder.exists() else folder
+
+
+def _aside(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.previous")
+
+
+def _flush(folder: Path) -> None:
+    """Put the folder's own entries, not only its files' contents, on disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,172 @@
+"""The part of the GMVAE that stage 2 keeps: synergy coefficients in, muscle actions out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Bounded
+
+from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
+
+__all__ = ["SynergyDecoder"]
+
+
+class _ScaledDecoder(nn.Module):
+    """u ∈ [-1, 1]^d → Dec(center + scale·u), plus an optional bounded residual."""
+
+    def __init__(self, decoder: ActionDecoder, residual: float) -> None:
+        super().__init__()
+        self.decoder = decoder
+        self.residual = residual
+        self.register_buffer("center", torch.zeros(decoder.latent_dim))
+        self.register_buffer("scale", torch.ones(decoder.latent_dim))
+
+    def forward(self, synergy: Tensor) -> Tensor:
+        decoder = self.decoder
+        if not self.residual:
+            return decoder(self.center + self.scale * synergy)
+        synergy, residual = synergy.split([decoder.latent_dim, decoder.action_dim], -1)
+        half_range = (decoder.high - decoder.low) / 2
+        action = decoder(self.center + self.scale * synergy) + self.residual * half_range * residual
+        return action.clamp(decoder.low, decoder.high)
+
+
+class SynergyDecoder(TensorDictModule):
+    """Decoder of synergy coefficients into muscle actions, in the policy's units.
+
+    A policy emits u ∈ [-1, 1]^d; the latent is center + scale·u, where center and scale come from
+    the GMVAE's aggregate posterior, so that the box covers the latents that real actions have.
+
+    With ``residual=ρ > 0`` the synergy key has d + n entries; the last n are a raw action in
+    [-1, 1]^n that moves each muscle by at most ρ of its half range.
+
+    Equation: a = Dec(z^a) of section 4.2.
+
+    Deviates: the paper gives no range for z^a and no residual.
+
+    Args:
+        num_synergies (int): number d of synergies.
+        action_dim (int): number n of actuators.
+
+    Keyword Args:
+        low, high (float or sequence of float): action bounds.
+        hidden (sequence of int): widths of the decoder's hidden layers.
+        residual (float): ρ in [0, 1]. Default: 0 (no residual).
+        in_keys (sequence of NestedKey): the coefficients. Default: ``("synergy",)``.
+        out_keys (sequence of NestedKey): the action. Default: ``("action",)``.
+
+    Keys:
+        reads ``synergy`` [*, d] (or [*, d+n]) in [-1, 1]; writes ``action`` [*, n] in [low, high].
+
+    Raises:
+        ValueError: if a size is not positive or ρ is outside [0, 1].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.modules import GMVAE, SynergyDecoder
+        >>> gmvae = GMVAE(action_dim=39, latent_dim=4)
+        >>> decoder = SynergyDecoder.from_gmvae(gmvae, actions=torch.rand(256, 39))
+        >>> decoder(TensorDict({"synergy": torch.zeros(2, 4)}, [2]))["action"].shape
+        torch.Size([2, 39])
+        >>> decoder.synergy_spec.shape
+        torch.Size([4])
+    """
+
+    def __init__(
+        self,
+        num_synergies: int,
+        action_dim: int,
+        *,
+        low: float | Sequence[float] = -1.0,
+        high: float | Sequence[float] = 1.0,
+        hidden: Sequence[int] = (128, 128),
+        residual: float = 0.0,
+        in_keys: Sequence[NestedKey] = ("synergy",),
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        if not 0.0 <= residual <= 1.0:
+            raise ValueError(
+                f"residual is {residual}; it is the share of an actuator's half range that the "
+                "policy may move directly and must lie in [0, 1]."
+            )
+        decoder = ActionDecoder(num_synergies, action_dim, low=low, high=high, hidden=hidden)
+        super().__init__(
+            _ScaledDecoder(decoder, residual), in_keys=list(in_keys), out_keys=list(out_keys)
+        )
+        self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
+
+    @classmethod
+    def from_gmvae(
+        cls, gmvae: GMVAE, actions: Tensor | None = None, *, residual: float = 0.0, **keys: Any
+    ) -> SynergyDecoder:
+        """Take over a copy of the GMVAE's decoder.
+
+        Args:
+            gmvae (GMVAE): the fitted model; left as it is.
+            actions (Tensor, optional): actions [N, n] it was fitted on. The box of coefficients
+                then spans the 1st to 99th percentile of their latents in each dimension; without
+                actions it spans two standard deviations of the mixture prior.
+
+        Keyword Args:
+            residual (float): see the class.
+            in_keys, out_keys: see the class.
+        """
+        decoder = cls(
+            gmvae.latent_dim,
+            gmvae.action_dim,
+            low=gmvae.low.tolist(),
+            high=gmvae.high.tolist(),
+            hidden=gmvae.decoder.hidden,
+            residual=residual,
+            **keys,
+        ).to(gmvae.low.device)
+        scaled = decoder.module
+        scaled.decoder.load_state_dict(deepcopy(gmvae.decoder.state_dict()))
+        with torch.no_grad():
+            if actions is None:
+                low = (gmvae.prior_loc - 2 * gmvae.prior_scale).amin(0)
+                high = (gmvae.prior_loc + 2 * gmvae.prior_scale).amax(0)
+            else:
+                low, high = gmvae.infer(actions).quantile(
+                    torch.tensor([0.01, 0.99], device=actions.device), dim=0
+                )
+            scaled.center.copy_((high + low) / 2)
+            scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
+        return decoder
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """JSON-able arguments: ``SynergyDecoder(**config)`` plus a state dict rebuilds it."""
+        return {
+            "num_synergies": self.num_synergies,
+            "action_dim": self.action_dim,
+            "low": self.low.tolist(),
+            "high": self.high.tolist(),
+            "hidden": list(self.module.decoder.hidden),
+            "residual": self.residual,
+        }
+
+    @property
+    def low(self) -> Tensor:
+        return self.module.decoder.low
+
+    @property
+    def high(self) -> Tensor:
+        return self.module.decoder.high
+
+    @property
+    def synergy_dim(self) -> int:
+        """Entries of the synergy key: d, or d + n with a residual."""
+        return self.num_synergies + (self.action_dim if self.residual else 0)
+
+    @property
+    def synergy_spec(self) -> Bounded:
+        """What a policy may emit: [-1, 1]^d, unbatched."""
+        return Bounded(-1.0, 1.0, shape=(self.synergy_dim,), device=self.low.device)

@@ -1,0 +1,107 @@
+"""Fine-tuning the synergy decoder on recorded pairs (Eq. 10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torchrl.objectives.common import LossModule
+
+from torchrl_etl.functional import reconstruction_loss
+from torchrl_etl.objectives.checks import check_choice, check_parts
+
+__all__ = ["DecoderLoss"]
+
+
+class DecoderLoss(LossModule):
+    r"""Squared error between the decoded synergy and the action recorded with it.
+
+    Equation: 10
+
+    Keys:
+        reads ``synergy`` [*, d] (or [*, d+n], see :class:`~torchrl_etl.modules.SynergyDecoder`)
+        and ``action`` [*, n]; writes ``loss_decoder``. Whatever keys the decoder itself reads and
+        writes, the batch is read at the keys set with :meth:`set_keys`.
+
+    Deviates: nothing here, but in use. The recorded action *is* ``Dec(synergy)`` of the decoder of
+        its time, so on fresh pairs the gradient is zero and on stale ones it pulls back to old
+        outputs; no reward reaches the decoder this way. As the sole fine-tuning signal it is the
+        paper's literal reading; next to an actor loss that runs through the decoder it is the
+        anchor that keeps the synergies from drifting.
+
+    Args:
+        decoder (TensorDictModule): synergy → action; first in key and first out key are used.
+
+    Keyword Args:
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default: ``"mean"``.
+
+    Raises:
+        ValueError: for an unknown reduction.
+        TypeError: if ``decoder`` is not a TensorDict module.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.modules import SynergyDecoder
+        >>> from torchrl_etl.objectives import DecoderLoss
+        >>> loss = DecoderLoss(SynergyDecoder(num_synergies=4, action_dim=39))
+        >>> batch = TensorDict({"synergy": torch.zeros(8, 4), "action": torch.ones(8, 39)}, [8])
+        >>> loss(batch)["loss_decoder"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change.
+
+        Attributes:
+            synergy (NestedKey): recorded synergy coefficients. Default: ``"synergy"``.
+            action (NestedKey): action recorded with them. Default: ``"action"``.
+        """
+
+        synergy: NestedKey = "synergy"
+        action: NestedKey = "action"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    decoder: TensorDictModuleBase
+    decoder_params: TensorDictParams
+    target_decoder_params: TensorDictParams
+
+    def __init__(
+        self,
+        decoder: TensorDictModuleBase,
+        *,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        check_choice("reduction", reduction, ("mean", "sum", "none"))
+        check_parts("decoder", decoder, TensorDictModuleBase, outputs=1)
+        super().__init__()
+        self.reduction = reduction
+        self.convert_to_functional(decoder, "decoder")
+        self._set_in_keys()
+        self.out_keys = ["loss_decoder"]
+
+    def _set_in_keys(self) -> None:
+        self.in_keys = [self.tensor_keys.synergy, self.tensor_keys.action]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of one batch of (synergy, action) pairs.
+
+        Args:
+            tensordict (TensorDictBase): pairs with any batch size; left unchanged.
+
+        Returns:
+            TensorDictBase: ``loss_decoder``.
+        """
+        synergy = tensordict.get(self.tensor_keys.synergy).detach()
+        action = tensordict.get(self.tensor_keys.action).detach()
+        inputs = TensorDict({self.decoder.in_keys[0]: synergy}, synergy.shape[:-1])
+        with self.decoder_params.to_module(self.decoder):
+            decoded = self.decoder(inputs).get(self.decoder.out_keys[0])
+        loss = reconstruction_loss(decoded, action)
+        return TensorDict({"loss_decoder": self._reduce_loss(loss, tensordict)})

@@ -1,0 +1,115 @@
+"""Checkpoints that survive a crash at any moment and say so when they did not."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+
+__all__ = ["Checkpoints", "write_atomically"]
+
+_SEAL = "seal.json"
+# What TorchRL writes for tensors and plain values. Anything else (a pickle above all) could run
+# code when loaded, so it is refused before TorchRL sees it.
+_PLAIN_FILES = {".json", ".memmap"}
+
+
+class Checkpoints(CheckpointRotation):
+    """TorchRL's checkpoint rotation, with a seal that proves a checkpoint whole.
+
+    ``torchrl.checkpoint`` (0.14.1) publishes a folder by an atomic rename, but neither flushes
+    its files to disk nor notices a damaged one. Here every file is flushed and its SHA-256 goes
+    into ``seal.json``, written last; a checkpoint whose seal is missing or does not match is
+    passed over for the one before.
+
+    Args:
+        directory (path): where the checkpoints of one stage live.
+
+    Keyword Args:
+        keep_last (int): checkpoints to keep; 2 or more, so that one is always whole.
+    """
+
+    def save(self, checkpoint: Checkpoint, *, step: int, **kwargs: Any) -> Path:
+        """Save, flush and seal a checkpoint of frame ``step``; returns its folder."""
+        self._remove_leftovers()
+        folder = super().save(checkpoint, step=step, **kwargs)
+        write_atomically(folder / _SEAL, json.dumps(_digests(folder, flush=True), indent=1))
+        return folder
+
+    def newest_whole(self) -> Path | None:
+        """The newest checkpoint that is whole; a damaged newer one is named in a warning."""
+        for folder in reversed(self.checkpoints()):
+            fault = _fault(folder)
+            if fault is None:
+                return folder
+            warnings.warn(
+                f"Checkpoint {folder} is damaged ({fault}); falling back to the one before.",
+                stacklevel=2,
+            )
+        return None
+
+    def load_newest_whole(self, checkpoint: Checkpoint) -> bool:
+        """Restore the newest whole checkpoint; False if there is none."""
+        folder = self.newest_whole()
+        if folder is not None:
+            checkpoint.load(folder)
+        return folder is not None
+
+    def _remove_leftovers(self) -> None:
+        """Delete the half-written folders of a process that was killed while saving."""
+        for pattern in (".*.stage-*", ".*.delete-*", ".*.backup-*"):
+            for leftover in self.directory.glob(pattern):
+                shutil.rmtree(leftover, ignore_errors=True)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that a crash leaves the old content or the new one, never a mixture."""
+    scratch = path.with_name(f".{path.name}.tmp")
+    with scratch.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(scratch, path)
+    _flush_folder(path.parent)
+
+
+def _digests(folder: Path, *, flush: bool = False) -> dict[str, str]:
+    digests = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name not in (_SEAL, f".{_SEAL}.tmp"):
+            with path.open("rb") as file:
+                if flush:
+                    os.fsync(file.fileno())
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            digests[path.relative_to(folder).as_posix()] = digest
+    return digests
+
+
+def _fault(folder: Path) -> str | None:
+    """What is wrong with a checkpoint folder, or None."""
+    try:
+        sealed = json.loads((folder / _SEAL).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return f"{_SEAL} is missing or unreadable: it was not written to the end"
+    foreign = [name for name in sealed if Path(name).suffix not in _PLAIN_FILES]
+    if foreign:
+        return f"{foreign[0]} is not a kind of file that a checkpoint holds"
+    found = _digests(folder)
+    if found != sealed:
+        names = sorted(found.items() ^ sealed.items())
+        return f"{names[0][0]} is not as it was written"
+    return None
+
+
+def _flush_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

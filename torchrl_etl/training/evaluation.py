@@ -1,0 +1,84 @@
+"""Evaluation on fixed seeds that training never uses."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+from torchrl_etl.analysis import Interval, interval, success_interval
+
+__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate"]
+
+EVALUATION_SEED = 10_000_000
+"""Seed of the first evaluation episode; training seeds are mixed so as to stay clear of it."""
+
+SOLVED_STEPS = 5
+"""An episode counts as solved if it was so on more than this many steps, as MyoSuite counts."""
+
+
+class Evaluation(NamedTuple):
+    """Episodes of one policy: undiscounted returns [E], lengths [E], and solved [E] or None."""
+
+    returns: list[float]
+    lengths: list[int]
+    solved: list[bool] | None
+
+    @property
+    def mean_return(self) -> Interval:
+        return interval(self.returns)
+
+    @property
+    def solved_share(self) -> Interval | None:
+        return None if self.solved is None else success_interval(self.solved)
+
+    def summary(self) -> dict[str, object]:
+        """JSON-able: intervals, and every episode's own numbers."""
+        summary: dict[str, object] = {"return": self.mean_return._asdict()}
+        if self.solved_share is not None:
+            summary["solved"] = self.solved_share._asdict()
+        return {**summary, "episodes": self._asdict(), "first_seed": EVALUATION_SEED}
+
+
+def evaluate(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    *,
+    episodes: int,
+    max_steps: int = 1000,
+    seed: int = EVALUATION_SEED,
+) -> Evaluation:
+    """Run the deterministic policy for one episode per evaluation seed.
+
+    Training's random numbers are left as they were, so evaluating more often changes nothing.
+
+    Args:
+        policy (TensorDictModuleBase): the policy.
+        env (EnvBase): a single (unbatched) environment, transforms included.
+
+    Keyword Args:
+        episodes (int): number of episodes; episode i is seeded with ``seed + i``.
+        max_steps (int): where to cut an episode that the environment does not end.
+        seed (int): first seed.
+
+    Returns:
+        Evaluation: solved is None where the environment does not define it.
+    """
+    returns, lengths, solved = [], [], []
+    devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
+    with (
+        torch.random.fork_rng(devices),
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+    ):
+        for episode in range(episodes):
+            torch.manual_seed(seed + episode)
+            env.set_seed(seed + episode)
+            rollout = env.rollout(max_steps, policy)
+            returns.append(rollout["next", "reward"].sum().item())
+            lengths.append(rollout.shape[-1])
+            if "solved" in rollout["next"].keys():
+                solved.append(rollout["next", "solved"].sum().item() > SOLVED_STEPS)
+    return Evaluation(returns, lengths, solved or None)

@@ -1,0 +1,244 @@
+"""A whole run: explore, condense, learn, report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.checkpoint import Checkpoint
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+
+from torchrl_etl.analysis import learning_curves
+from torchrl_etl.envs import actuator_names, episode_length, make_env, resolve_task
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.atomic_folder import surviving_folder
+from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
+from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.config import validate
+from torchrl_etl.training.evaluation import Evaluation, evaluate
+from torchrl_etl.training.explore import ExploreStage
+from torchrl_etl.training.learn import LearnStage
+from torchrl_etl.training.loop import StopOnSignal, run_stage
+from torchrl_etl.training.run_folder import RunFolder, facts
+from torchrl_etl.training.synergy_report import describe_synergies, draw_synergies
+from torchrl_etl.transforms import SynergyAction
+
+__all__ = ["Experiment"]
+
+
+class Experiment:
+    """One run of ETL from a resolved configuration.
+
+    Args:
+        config (DictConfig): see ``recipes/conf/config.yaml``.
+
+    Keyword Args:
+        resume (path, optional): the run folder to go on in.
+        say (callable): where messages for a person go, one line each. Default: nowhere.
+
+    Raises:
+        ValueError: if the configuration is not one that can run.
+    """
+
+    def __init__(
+        self,
+        config: DictConfig,
+        *,
+        resume: Path | None = None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        validate(config)
+        self.config, self.say = config, say
+        self.device = torch.device(config.device)
+        self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
+        self.spec = self.make_env()
+        self.actuators = actuator_names(self.spec)
+        if config.synergies is not None:
+            self._check_bundle(config.synergies)
+        if config.num_synergies > len(self.actuators):
+            raise ValueError(
+                f"num_synergies is {config.num_synergies} but {config.env} has "
+                f"{len(self.actuators)} actuators; choose at most that many."
+            )
+        self.resume = resume is not None
+        self.folder = RunFolder(resume or Path(config.run_dir), config)
+
+    def run(self) -> dict[str, Any]:
+        """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
+        self.folder.open(resume=self.resume)
+        if self.config.threads:
+            torch.set_num_threads(self.config.threads)
+        summary: dict[str, Any] = {
+            "env": self.config.env,
+            "goal": self.config.goal,
+            "seed": self.config.seed,
+        }
+        with StopOnSignal() as stop:
+            if (
+                self.config.synergies is None
+                and not surviving_folder(self.folder.synergies).exists()
+            ):
+                self._explore(stop)
+            decoder, info = self._decoder()
+            summary["synergies"] = {"task": info.task, **info.facts}
+            if self.config.stage != "explore":
+                summary["learn"] = self._learn(decoder, stop)
+        self.folder.write_json("summary.json", {**summary, "versions": facts()})
+        return summary
+
+    # Stage 1 -----------------------------------------------------------------------------------
+
+    def explore_stage(self) -> ExploreStage:
+        """Stage 1 as configured, before its first frame."""
+        options = self._options("explore")
+        activations = options["fit"]["actions"] == "activation"
+        return ExploreStage(
+            partial(self._batched_env, activations=activations),
+            self.spec,
+            num_synergies=self.config.num_synergies,
+            seed=2 * self.config.seed,
+            device=self.device,
+            **options,
+        )
+
+    def _explore(self, stop: StopOnSignal) -> None:
+        """Explore and leave a bundle in the run folder; that it is there says that this is done."""
+        stage = self.explore_stage()
+        run_stage(stage, self.folder, stop, **self._loop_options())
+        torch.manual_seed(stage.seed)  # finishing gives the same whether or not it was resumed
+        decoder = stage.finish()
+        numbers, warnings = describe_synergies(stage.gmvae, decoder, stage.actions())
+        numbers["frames"] = stage.frames
+        for warning in warnings:
+            self.say(f"Warning: {warning}")
+        if self.config.pictures:
+            draw_synergies(stage, decoder, self.actuators, self.folder.pictures)
+        save_bundle(
+            decoder,
+            self.folder.synergies,
+            task=resolve_task(self.config.env, self.config.goal).id,
+            actuators=self.actuators,
+            num_components=stage.gmvae.num_components,
+            facts={**numbers, "seed": self.config.seed, **facts()},
+        )
+
+    # Stage 2 -----------------------------------------------------------------------------------
+
+    def learn_stage(self, decoder: SynergyDecoder) -> LearnStage:
+        """Stage 2 as configured, before its first frame."""
+        return LearnStage(
+            self._batched_env,
+            self.spec,
+            decoder,
+            seed=2 * self.config.seed + 1,
+            device=self.device,
+            **self._options("learn"),
+        )
+
+    def learned(self) -> LearnStage:
+        """Stage 2 with the weights of its newest whole checkpoint.
+
+        Raises:
+            FileNotFoundError: if the run has no such checkpoint.
+        """
+        folder = Checkpoints(self.folder.checkpoints(LearnStage.name), keep_last=2).newest_whole()
+        if folder is None:
+            raise FileNotFoundError(
+                f"{self.folder.path} holds no whole checkpoint of stage 2; evaluate a run that has "
+                "begun to learn."
+            )
+        stage = self.learn_stage(self._decoder()[0])
+        Checkpoint(actor=stage.policy, decoder=stage.decoder).load(folder)
+        return stage
+
+    def _decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
+        bundle = self.config.synergies or self.folder.synergies
+        return load_bundle(bundle, residual=self.config.learn.residual)
+
+    def evaluation_env(self, stage: LearnStage) -> EnvBase:
+        """One simulator, driven by the stage's decoder."""
+        return TransformedEnv(self.make_env(), SynergyAction(stage.decoder))
+
+    def evaluator(self, stage: LearnStage) -> Callable[[], Evaluation]:
+        """Evaluates the stage's present policy on the evaluation seeds."""
+        steps = episode_length(self.config.env, self.config.goal) or 1000
+        return partial(
+            evaluate,
+            stage.policy,
+            self.evaluation_env(stage),
+            episodes=self.config.evaluation.episodes,
+            max_steps=steps,
+        )
+
+    def _learn(self, decoder: SynergyDecoder, stop: StopOnSignal) -> dict[str, Any]:
+        stage = self.learn_stage(decoder)
+        charged = self.config.explore.frames if self.config.synergies is None else 0
+        evaluator = self.evaluator(stage)
+        run_stage(
+            stage,
+            self.folder,
+            stop,
+            evaluate=evaluator,
+            evaluate_every=self.config.evaluation.every,
+            offset=charged,
+            **self._loop_options(),
+        )
+        after = evaluator()
+        if self.config.pictures:
+            self._draw_curves(charged)
+        summary: dict[str, Any] = {"frames": stage.frames, "frames_charged": charged + stage.frames}
+        for key, value in (("return", after.mean_return), ("solved", after.solved_share)):
+            if value is not None:
+                before = self.folder.series(f"learn/eval/{key}")[1]
+                summary[key] = {
+                    "before": before[0] if before else math.nan,
+                    "after": value.mean,
+                    "low": value.low,
+                    "high": value.high,
+                }
+        return summary
+
+    def _draw_curves(self, charged: int) -> None:
+        frames, returns = self.folder.series("learn/eval/return")
+        solved = dict(zip(*self.folder.series("learn/eval/solved"), strict=True))
+        rows = [
+            {"frames": frame, "return": value, "solved": solved.get(frame)}
+            for frame, value in zip(frames, returns, strict=True)
+        ]
+        learning_curves(
+            rows,
+            self.folder.pictures / "learning_curves.png",
+            explore_frames=charged or None,
+            title=f"{self.config.env} ({self.config.goal} goal)",
+        )
+
+    # Shared ------------------------------------------------------------------------------------
+
+    def _batched_env(self, seed: int, *, activations: bool = False) -> TransformedEnv:
+        env = self.make_env(
+            num_envs=self.config.collector.num_envs, seed=seed, activations=activations
+        )
+        return TransformedEnv(env, RewardSum())
+
+    def _options(self, stage: str) -> dict[str, Any]:
+        options = OmegaConf.to_container(self.config[stage], resolve=True)
+        options.pop("residual", None)  # an option of the decoder, taken when its bundle is loaded
+        return {"frames_per_batch": self.config.collector.frames_per_batch, **options}
+
+    def _loop_options(self) -> dict[str, Any]:
+        return {
+            "checkpoint_every": self.config.checkpoint.every,
+            "keep": self.config.checkpoint.keep,
+            "log_every": self.config.log_every,
+            "show_progress": self.config.progress,
+        }
+
+    def _check_bundle(self, path: str) -> None:
+        _, info = load_bundle(path)
+        space = self.spec.full_action_spec_unbatched["action"].space
+        check_compatible(info, self.actuators, space.low.tolist(), space.high.tolist())

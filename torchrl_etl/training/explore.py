@@ -1,0 +1,194 @@
+"""Stage 1: explore along latent directions and condense the muscle actions into synergies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_etl.modules import (
+    GMVAE,
+    GaussianDynamics,
+    StateEncoder,
+    SynergyDecoder,
+    make_actor,
+    make_critic,
+)
+from torchrl_etl.objectives import BehavioralMetricLoss, GMVAELoss
+from torchrl_etl.training.stage import Stage, entropy_target, gradient_step
+from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward
+
+__all__ = ["ExploreStage"]
+
+GMVAEActions = Literal["mean", "sampled", "activation"]
+
+
+class ExploreStage(Stage):
+    """Algorithm 1, phase 1: SAC on the intrinsic reward, the metric and the GMVAE side by side.
+
+    Every update draws one batch. Its bonus is computed as it is drawn, with the state encoder as
+    it then is; SAC learns on the bonus, the encoder on the behavioral metric with the task's own
+    reward, and the GMVAE on the batch's actions.
+
+    Deviates: the GMVAE sees the exploration policy's mean actions (``actions="mean"``), since
+    actions sampled from a maximum-entropy policy are nearly white noise that few synergies
+    cannot explain; ``"sampled"`` is the print. After the last frame the GMVAE is trained on for
+    ``final_updates`` (Algorithm 1 stops with the last frame: 0).
+
+    Args:
+        make_base_env (callable): seed → environment to which ETL's transforms are appended.
+        spec (EnvBase): any instance of that environment, to read sizes and bounds from.
+
+    Keyword Args:
+        num_synergies (int): d; also the embedding's size k unless ``encoder`` says otherwise.
+        network, encoder, direction, bonus, metric, gmvae, sac (mapping): keyword arguments of
+            :func:`~torchrl_etl.modules.make_actor`/``make_critic``,
+            :class:`~torchrl_etl.modules.StateEncoder`,
+            :class:`~torchrl_etl.transforms.DirectionPrimer`,
+            :class:`~torchrl_etl.transforms.IntrinsicReward`,
+            :class:`~torchrl_etl.objectives.BehavioralMetricLoss`,
+            :class:`~torchrl_etl.modules.GMVAE`, and of SAC (``gamma``, ``tau``, ``lr``,
+            ``alpha_init``, ``action_std``).
+        fit (mapping): how the GMVAE is trained: ``actions`` ("mean", "sampled" or
+            "activation"), ``best_share`` (share of each batch, by task reward, that it sees),
+            ``lr``, ``kl_weight``, ``component_kl_weight``, ``final_updates``.
+        encoder_lr (float), encoder_tau (float): of φ and of its target.
+        **stage: see :class:`~torchrl_etl.training.stage.Stage`.
+    """
+
+    name = "explore"
+
+    def __init__(
+        self,
+        make_base_env: Callable[[int], TransformedEnv],
+        spec: EnvBase,
+        *,
+        num_synergies: int,
+        network: Mapping[str, Any],
+        encoder: Mapping[str, Any],
+        encoder_lr: float,
+        encoder_tau: float,
+        direction: Mapping[str, Any],
+        bonus: Mapping[str, Any],
+        metric: Mapping[str, Any],
+        gmvae: Mapping[str, Any],
+        fit: Mapping[str, Any],
+        sac: Mapping[str, Any],
+        device: torch.device,
+        **stage: Any,
+    ) -> None:
+        torch.manual_seed(stage["seed"])
+        action_spec = spec.full_action_spec_unbatched["action"]
+        observation_dim = spec.observation_spec["observation"].shape[-1]
+        encoder = {"embedding_dim": num_synergies, **encoder}
+        inputs = {"observation": observation_dim, "direction": encoder["embedding_dim"]}
+
+        actor = make_actor(inputs, action_spec, **network).to(device)
+        critic = make_critic({**inputs, "action": action_spec.shape[-1]}, **network).to(device)
+        self.encoder = StateEncoder(observation_dim, **encoder).to(device)
+        self.gmvae = GMVAE.from_spec(action_spec, num_synergies, **gmvae).to(device)
+
+        super().__init__(
+            lambda seed: make_base_env(seed).append_transform(
+                DirectionPrimer(encoder["embedding_dim"], **direction)
+            ),
+            actor,
+            device=device,
+            **stage,
+        )
+        self.bonus = IntrinsicReward(self.encoder, **bonus)
+        self.buffer.append_transform(self.bonus)
+
+        self.sac = SACLoss(
+            actor,
+            critic,
+            action_spec=action_spec,
+            target_entropy=entropy_target(action_spec, sac["action_std"]),
+            alpha_init=sac["alpha_init"],
+        ).to(device)
+        self.sac.set_keys(reward="intrinsic_reward")
+        self.sac.make_value_estimator(gamma=sac["gamma"])
+        _ = self.sac.target_entropy  # created lazily; it must exist before the optimizer does
+        self.sac_optimizer = torch.optim.Adam(self.sac.parameters(), lr=sac["lr"])
+        self.sac_target = SoftUpdate(self.sac, tau=sac["tau"])
+
+        dynamics = None
+        if metric.get("divergence") == "gaussian":
+            dynamics = GaussianDynamics(self.encoder.embedding_dim).to(device)
+        self.metric = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(device)
+        self.metric_optimizer = torch.optim.Adam(self.metric.parameters(), lr=encoder_lr)
+        self.metric_target = SoftUpdate(self.metric, tau=encoder_tau)
+
+        fit = dict(fit)
+        self.fit_actions: GMVAEActions = fit.pop("actions")
+        self.best_share, self.final_updates = fit.pop("best_share"), fit.pop("final_updates")
+        self.gmvae_optimizer = torch.optim.Adam(self.gmvae.parameters(), lr=fit.pop("lr"))
+        self.gmvae_loss = GMVAELoss(self.gmvae, **fit)
+
+    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
+        match self.fit_actions:
+            case "mean":
+                shown = self.policy.build_dist_from_params(batch).deterministic_sample
+            case "sampled":
+                shown = batch["action"]
+            case "activation":
+                shown = batch["next", "activation"]
+        kept = batch.select("observation", "direction", "action", ("next", "observation"))
+        kept["next"].update(batch["next"].select("direction", "done", "terminated"))
+        kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
+        return kept.set("shown_action", shown)
+
+    def update(self) -> TensorDictBase:
+        batch = self.buffer.sample()  # ("next", "intrinsic_reward") appears here, from today's φ
+
+        sac = self.sac(batch)
+        gradient_step(self.sac_optimizer, sac["loss_actor"], sac["loss_qvalue"], sac["loss_alpha"])
+        self.sac_target.step()
+
+        metric = self.metric(batch)
+        gradient_step(
+            self.metric_optimizer,
+            *(value for key, value in metric.items() if key.startswith("loss_")),
+        )
+        self.metric_target.step()
+
+        gmvae = self.gmvae_loss(self._best(batch))
+        gradient_step(self.gmvae_optimizer, gmvae["loss_gmvae"])
+
+        bonus = batch["next", "intrinsic_reward"].mean()
+        return TensorDict({**sac, **metric, **gmvae, "intrinsic_reward": bonus}, [])
+
+    def _best(self, batch: TensorDictBase) -> TensorDictBase:
+        """The better-rewarded share of a batch, as what the GMVAE sees."""
+        actions = batch["shown_action"]
+        if self.best_share < 1:
+            count = max(1, round(self.best_share * len(actions)))
+            actions = actions[batch["next", "reward"].squeeze(-1).topk(count).indices]
+        return TensorDict({"action": actions}, actions.shape[:1])
+
+    def finish(self) -> SynergyDecoder:
+        """Train the GMVAE on for ``final_updates``; returns the decoder for stage 2."""
+        for _ in range(self.final_updates):
+            loss = self.gmvae_loss(self._best(self.buffer.sample()))
+            gradient_step(self.gmvae_optimizer, loss["loss_gmvae"])
+        return SynergyDecoder.from_gmvae(self.gmvae, self.actions())
+
+    def actions(self, count: int = 20_000) -> Tensor:
+        """Up to ``count`` of the latest actions that the GMVAE was trained on, [N, n]."""
+        return self.buffer.storage[:]["shown_action"][-count:]
+
+    def parts(self) -> dict[str, Any]:
+        return {
+            "sac": self.sac,
+            "sac_optimizer": self.sac_optimizer,
+            "metric": self.metric,
+            "metric_optimizer": self.metric_optimizer,
+            "gmvae": self.gmvae,
+            "gmvae_optimizer": self.gmvae_optimizer,
+            "bonus": self.bonus,
+        }

@@ -1,0 +1,130 @@
+"""Stage 2: learn the task in synergy space while the decoder adapts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.objectives import SoftUpdate
+
+from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
+from torchrl_etl.training.stage import Stage, entropy_target, gradient_step
+from torchrl_etl.transforms import SynergyAction
+
+__all__ = ["LearnStage"]
+
+FineTuning = Literal["frozen", "reconstruction", "critic"]
+
+
+class LearnStage(Stage):
+    """Algorithm 1, phase 2: SAC on synergy coefficients, the decoder mapping them to muscles.
+
+    The decoder is fine-tuned in one of three modes: ``"critic"`` (default: the actor loss runs
+    through the decoder, Eq. 10 is the anchor that keeps it from drifting), ``"reconstruction"``
+    (Eq. 10 alone, as printed) or ``"frozen"``.
+
+    Deviates: see :class:`~torchrl_etl.objectives.SynergySACLoss` and
+    :class:`~torchrl_etl.objectives.DecoderLoss`.
+
+    Args:
+        make_base_env (callable): seed → environment to which ETL's transforms are appended.
+        spec (EnvBase): any instance of that environment, to read sizes and bounds from.
+        decoder (SynergyDecoder): from stage 1 or a bundle; it is trained in place.
+
+    Keyword Args:
+        network, sac (mapping): as in :class:`~torchrl_etl.training.explore.ExploreStage`.
+        fine_tuning (str): "critic", "reconstruction" or "frozen".
+        decoder_lr (float): learning rate of the decoder.
+        anchor (float): weight of Eq. 10 under "critic".
+        **stage: see :class:`~torchrl_etl.training.stage.Stage`.
+    """
+
+    name = "learn"
+
+    def __init__(
+        self,
+        make_base_env: Callable[[int], TransformedEnv],
+        spec: EnvBase,
+        decoder: SynergyDecoder,
+        *,
+        network: Mapping[str, Any],
+        sac: Mapping[str, Any],
+        fine_tuning: FineTuning,
+        decoder_lr: float,
+        anchor: float,
+        device: torch.device,
+        **stage: Any,
+    ) -> None:
+        torch.manual_seed(stage["seed"])
+        observation_dim = spec.observation_spec["observation"].shape[-1]
+        self.decoder = decoder.to(device)
+        actor = make_actor(
+            {"observation": observation_dim}, decoder.synergy_spec, out_key="synergy", **network
+        ).to(device)
+        critic = make_critic(
+            {"observation": observation_dim, "action": decoder.action_dim}, **network
+        ).to(device)
+
+        super().__init__(
+            lambda seed: make_base_env(seed).append_transform(SynergyAction(decoder)),
+            actor,
+            device=device,
+            **stage,
+        )
+        self.sac = SynergySACLoss(
+            actor,
+            critic,
+            decoder,
+            train_decoder=fine_tuning == "critic",
+            action_spec=decoder.synergy_spec,
+            target_entropy=entropy_target(decoder.synergy_spec, sac["action_std"]),
+            alpha_init=sac["alpha_init"],
+        ).to(device)
+        self.sac.make_value_estimator(gamma=sac["gamma"])
+        _ = self.sac.target_entropy  # created lazily; it must exist before the optimizer does
+        self.sac_target = SoftUpdate(self.sac, tau=sac["tau"])
+
+        self.decoder_loss = DecoderLoss(decoder)
+        self.anchor = {"frozen": 0.0, "reconstruction": 1.0, "critic": anchor}[fine_tuning]
+        tuned = [] if fine_tuning == "frozen" else list(decoder.parameters())
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": _without(self.sac.parameters(), decoder.parameters()), "lr": sac["lr"]},
+                {"params": tuned, "lr": decoder_lr},
+            ]
+        )
+
+    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
+        kept = batch.select("observation", "synergy", ("next", "observation"))
+        kept["action"] = batch["next", "executed_action"]  # logged when it happened: Eq. 10's pair
+        kept["next"].update(batch["next"].select("done", "terminated"))
+        kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
+        return kept
+
+    def update(self) -> TensorDictBase:
+        batch = self.buffer.sample()
+        sac = self.sac(batch)
+        losses = [sac["loss_actor"], sac["loss_qvalue"], sac["loss_alpha"]]
+        reconstruction = self.decoder_loss(batch)["loss_decoder"]
+        if self.anchor:
+            losses.append(self.anchor * reconstruction)
+        gradient_step(self.optimizer, *losses)
+        self.sac_target.step()
+        return TensorDict({**sac, "loss_decoder": reconstruction}, [])
+
+    def parts(self) -> dict[str, Any]:
+        return {
+            "sac": self.sac,
+            "optimizer": self.optimizer,
+            "actor": self.policy,
+            "decoder": self.decoder,
+        }
+
+
+def _without(parameters: Any, excluded: Any) -> list[torch.nn.Parameter]:
+    known = {id(parameter) for parameter in excluded}
+    return [parameter for parameter in parameters if id(parameter) not in known]

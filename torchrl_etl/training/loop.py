@@ -1,0 +1,188 @@
+"""The loop of a stage: collect, update, log, evaluate, save; stop cleanly when asked."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from types import FrameType, TracebackType
+
+from tensordict import TensorDictBase
+from tqdm import tqdm
+
+from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.evaluation import Evaluation
+from torchrl_etl.training.run_folder import RunFolder
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["Interrupted", "StopOnSignal", "run_stage"]
+
+
+class Interrupted(KeyboardInterrupt):
+    """The run was asked to stop; everything up to now is saved."""
+
+
+class StopOnSignal(AbstractContextManager):
+    """Turns the first Ctrl-C or SIGTERM into a request to stop at the next safe point.
+
+    A second one interrupts at once.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> StopOnSignal:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+def run_stage(
+    stage: Stage,
+    folder: RunFolder,
+    stop: StopOnSignal,
+    *,
+    evaluate: Callable[[], Evaluation] | None = None,
+    evaluate_every: int = 0,
+    checkpoint_every: int,
+    keep: int = 2,
+    log_every: int,
+    offset: int = 0,
+    show_progress: bool = True,
+) -> None:
+    """Run a stage to the end of its budget, going on from its newest whole checkpoint.
+
+    Every checkpoint starts new episodes (see :meth:`Stage.restart_collection`), so a run that was
+    killed and resumed draws the same numbers as one that was not.
+
+    Args:
+        stage (Stage): what to run.
+        folder (RunFolder): where metrics and checkpoints go.
+        stop (StopOnSignal): asked after every batch.
+
+    Keyword Args:
+        evaluate (callable, optional): evaluates the present policy.
+        evaluate_every, checkpoint_every, log_every (int): in frames of this stage.
+        keep (int): checkpoints to keep.
+        offset (int): frames charged before this stage.
+        show_progress (bool): draw a progress bar.
+
+    Raises:
+        Interrupted: after saving, if a stop was requested.
+    """
+    checkpoints = Checkpoints(folder.checkpoints(stage.name), keep_last=keep)
+    resumed = checkpoints.load_newest_whole(stage.checkpoint())
+    # A fresh start also forgets the row of frame 0 that a run killed before saving may have left.
+    folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
+    if stage.finished:
+        return
+
+    bar = tqdm(
+        total=stage.budget,
+        initial=stage.frames,
+        desc=stage.name,
+        unit="frame",
+        disable=not show_progress,
+        mininterval=0.5,
+    )
+    report = _Report(stage, folder, bar, offset)
+    try:
+        if not resumed and evaluate is not None:
+            report.evaluation(evaluate())
+        stage.restart_collection()
+        while not stage.finished:
+            before = stage.frames
+            report.batch(stage.collect(), stage.learn())
+            if _passed(before, stage.frames, log_every) or stage.finished:
+                report.write()
+            if evaluate is not None and (
+                _passed(before, stage.frames, evaluate_every) or stage.finished
+            ):
+                report.evaluation(evaluate())
+            if _passed(before, stage.frames, checkpoint_every) or stage.finished or stop.requested:
+                checkpoints.save(stage.checkpoint(), step=stage.frames)
+                if stop.requested and not stage.finished:
+                    raise Interrupted
+                if not stage.finished:
+                    stage.restart_collection()
+                    report.forget_open_window()
+    finally:
+        bar.close()
+        stage.close()
+
+
+class _Report:
+    """Means over the window since the last row, for the logs and the progress bar."""
+
+    def __init__(self, stage: Stage, folder: RunFolder, bar: tqdm, offset: int) -> None:
+        self.stage, self.folder, self.bar, self.offset = stage, folder, bar, offset
+        self.shown: dict[str, str] = {}
+        self.forget_open_window()
+
+    def forget_open_window(self) -> None:
+        """Start a new window; checkpoints do, so that a resumed run logs the same means."""
+        self.returns: list[float] = []
+        self.solved: list[float] = []
+        self.losses: list[TensorDictBase] = []
+        self.since, self.start = self.stage.frames, time.perf_counter()
+
+    def batch(self, batch: TensorDictBase, losses: TensorDictBase | None) -> None:
+        ended = batch["next", "done"].squeeze(-1)
+        self.returns += batch["next", "episode_reward"][ended].flatten().tolist()
+        if "solved" in batch["next"].keys():
+            self.solved.append(batch["next", "solved"].float().mean().item())
+        if losses is not None:
+            self.losses.append(losses)
+        self.bar.update(self.stage.frames - self.bar.n)
+
+    def write(self) -> None:
+        values = {"updates": self.stage.progress.updates, "episodes": self.stage.progress.episodes}
+        if self.returns:
+            values["return"] = sum(self.returns) / len(self.returns)
+        if self.solved:
+            values["solved_steps"] = sum(self.solved) / len(self.solved)
+        for key in self.losses[0].keys() if self.losses else ():
+            values[key] = sum(loss[key].item() for loss in self.losses) / len(self.losses)
+        elapsed = time.perf_counter() - self.start
+        values["frames_per_second"] = (self.stage.frames - self.since) / elapsed
+        self._log(values)
+        if self.returns:
+            self._show(**{"return": f"{values['return']:.1f}"})
+        self.forget_open_window()
+
+    def evaluation(self, evaluation: Evaluation) -> None:
+        values = {"eval/return": evaluation.mean_return.mean}
+        if evaluation.solved_share is not None:
+            values["eval/solved"] = evaluation.solved_share.mean
+            self._show(solved=f"{values['eval/solved']:.0%}")
+        self._show(eval=f"{values['eval/return']:.1f}")
+        self._log(values)
+
+    def _log(self, values: dict[str, float]) -> None:
+        frame = self.offset + self.stage.frames
+        self.folder.log({f"{self.stage.name}/{key}": v for key, v in values.items()}, frame)
+
+    def _show(self, **shown: str) -> None:
+        self.shown.update(shown)
+        self.bar.set_postfix(self.shown)
+
+
+def _passed(before: int, after: int, every: int) -> bool:
+    """Whether a multiple of ``every`` lies in (before, after]."""
+    return every > 0 and before // every < after // every

@@ -1,0 +1,155 @@
+"""The folder that a run leaves behind: configuration, versions, metrics, checkpoints, pictures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
+
+from torchrl_etl.training.checkpoints import write_atomically
+
+__all__ = ["RunFolder"]
+
+_PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "myosuite", "dm-control")
+
+
+class RunFolder:
+    """Paths of a run and the writers of its small files.
+
+    Args:
+        path (path): the folder; nothing is written before :meth:`open`.
+        config (DictConfig): resolved configuration; its ``log`` names the loggers.
+    """
+
+    def __init__(self, path: Path, config: DictConfig) -> None:
+        self.path = Path(path).resolve()
+        self._config, self._loggers, self._purge_step = config, None, None
+
+    def open(self, *, resume: bool) -> None:
+        """Make the folder and write the configuration and the versions into it.
+
+        Raises:
+            FileExistsError: if the folder already holds a run and ``resume`` is False.
+            OSError: if the folder cannot be written.
+        """
+        if (self.path / "config.yaml").exists() and not resume:
+            raise FileExistsError(
+                f"{self.path} already holds a run; go on with it by resume={self.path}, or choose "
+                "another run_dir."
+            )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
+        except OSError as error:
+            raise OSError(
+                f"The run folder {self.path} cannot be written ({error.strerror}); choose another "
+                "run_dir or mend its permissions."
+            ) from error
+        # One entry a start: a run may be resumed on another machine or commit.
+        versions = self.path / "versions.json"
+        before = json.loads(versions.read_text()) if versions.exists() else []
+        self.write_json("versions.json", [*before, facts()])
+
+    def write_json(self, name: str, content: Any) -> Path:
+        """Write a JSON file atomically; returns its path."""
+        write_atomically(self.path / name, json.dumps(content, indent=2) + "\n")
+        return self.path / name
+
+    def checkpoints(self, stage: str) -> Path:
+        return self.path / "checkpoints" / stage
+
+    @property
+    def synergies(self) -> Path:
+        return self.path / "synergies"
+
+    @property
+    def pictures(self) -> Path:
+        (self.path / "pictures").mkdir(exist_ok=True)
+        return self.path / "pictures"
+
+    @property
+    def scalars(self) -> Path:
+        return self.path / "csv" / "scalars"
+
+    def forget_after(self, stage: str, frame: int) -> None:
+        """Drop the rows of ``stage`` later than ``frame``, which a resumed run will write again."""
+        for path in sorted((self.scalars / stage).rglob("*.csv")):
+            rows = [row for row in _read(path) if row[0] <= frame]
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(rows)
+            write_atomically(path, text.getvalue())
+        if frame >= 0:
+            self._purge_step = frame + 1
+
+    def log(self, values: Mapping[str, float], frame: int) -> None:
+        """Log scalars at a frame count that charges both stages."""
+        if self._loggers is None:
+            self._loggers = [self._logger(name) for name in self._config.log]
+        for logger in self._loggers:
+            for key, value in values.items():
+                logger.log_scalar(key, float(value), step=frame)
+
+    def series(self, key: str) -> tuple[list[int], list[float]]:
+        """Frames and values that the CSV logger kept under ``key``."""
+        path = self.scalars / f"{key}.csv"
+        rows = _read(path) if path.exists() else []
+        return [frame for frame, _ in rows], [value for _, value in rows]
+
+    def _logger(self, name: str) -> Logger:
+        if name == "tensorboard":
+            return _ResumableTensorboard(str(self.path), self._purge_step)
+        extra = self._config.get("logger_kwargs", {}).get(name, {})
+        return get_logger(name, str(self.path), name, **{f"{name}_kwargs": dict(extra)})
+
+
+class _ResumableTensorboard(TensorboardLogger):
+    """TorchRL's logger (0.14.1) has no way to hide what a killed run wrote past its checkpoint."""
+
+    def __init__(self, log_dir: str, purge_step: int | None) -> None:
+        self._purge_step = purge_step
+        super().__init__("tensorboard", log_dir)
+
+    def _create_experiment(self) -> Any:
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(os.path.join(self.log_dir, self.exp_name), purge_step=self._purge_step)
+
+
+def facts() -> dict[str, Any]:
+    """Versions, commit and machine class: what a number must carry to be believed."""
+    return {
+        "torchrl_etl": version("torchrl_etl"),
+        "commit": _commit(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in _PACKAGES},
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def _commit() -> str | None:
+    here = Path(__file__).parent
+    git: Sequence[str] = ("git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12")
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _read(path: Path) -> list[tuple[int, float]]:
+    """Whole rows of a scalar file; a row that was being written at a crash is dropped."""
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        frame, separator, value = line.partition(",")
+        if separator and value:
+            rows.append((int(frame), float(value)))
+    return rows

@@ -1,0 +1,129 @@
+"""What stage 1 found: numbers, warnings in words, and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_etl.analysis import (
+    control_authority,
+    embedding,
+    mixture_usage,
+    nmf_vaf,
+    pca_vaf,
+    synergy_heatmap,
+    synergy_warnings,
+    vaf_curve,
+    variance_accounted_for,
+)
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.objectives import GMVAELoss
+from torchrl_etl.training.explore import ExploreStage
+from torchrl_etl.training.stage import gradient_step
+
+__all__ = ["describe_synergies", "draw_synergies", "fit_gmvae"]
+
+
+def fit_gmvae(
+    gmvae: GMVAE, actions: Tensor, *, updates: int, batch_size: int = 256, lr: float = 1e-3
+) -> GMVAE:
+    """Train a GMVAE on an array of actions [N, n] by Eq. 9; returns it.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.analysis import variance_accounted_for
+        >>> _ = torch.manual_seed(0)
+        >>> actions = torch.tanh(torch.randn(2048, 2) @ torch.randn(2, 8))
+        >>> gmvae = fit_gmvae(GMVAE(8, latent_dim=2), actions, updates=300)
+        >>> variance_accounted_for(actions, gmvae.reconstruct(actions).detach()) > 0.8
+        True
+    """
+    loss_module = GMVAELoss(gmvae)
+    optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr)
+    for _ in range(updates):
+        chosen = actions[torch.randint(len(actions), (batch_size,), device=actions.device)]
+        loss = loss_module(TensorDict({"action": chosen}, [batch_size]))
+        gradient_step(optimizer, loss["loss_gmvae"])
+    return gmvae
+
+
+@torch.no_grad()
+def describe_synergies(
+    gmvae: GMVAE, decoder: SynergyDecoder, actions: Tensor
+) -> tuple[dict[str, float], list[str]]:
+    """Numbers of a synergy space on the actions [N, n] it was fitted to, and its warnings.
+
+    Returns:
+        dict: ``vaf``, ``pca_vaf`` and ``nmf_vaf`` at the same d, ``control_authority`` (mean share
+        of an actuator's range that the decoder commands) and ``effective_components``.
+        list of str: what is wrong with it, in words.
+    """
+    authority = control_authority(decoder)
+    usage = mixture_usage(gmvae, actions)
+    vaf = variance_accounted_for(actions, gmvae.reconstruct(actions))
+    pca = pca_vaf(actions, gmvae.latent_dim)
+    numbers = {
+        "vaf": vaf,
+        "pca_vaf": pca,
+        "nmf_vaf": nmf_vaf(actions, gmvae.latent_dim, low=gmvae.low),
+        "control_authority": authority.mean().item(),
+        "effective_components": usage.effective,
+    }
+    return numbers, synergy_warnings(vaf=vaf, pca_vaf=pca, authority=authority, usage=usage)
+
+
+def draw_synergies(
+    stage: ExploreStage,
+    decoder: SynergyDecoder,
+    names: Sequence[str],
+    folder: Path,
+    *,
+    dims: Sequence[int] = (1, 2, 4, 8, 16),
+    updates: int = 500,
+) -> None:
+    """Heat map over named muscles, VAF against d beside PCA and NMF, state embedding.
+
+    Args:
+        stage (ExploreStage): a finished stage.
+        decoder (SynergyDecoder): its decoder.
+        names (sequence of str): actuators, in action order.
+        folder (path): where the PNGs go.
+
+    Keyword Args:
+        dims (sequence of int): numbers of synergies on the VAF curve; those above n are left out.
+        updates (int): GMVAE updates for every other d than the stage's own.
+    """
+    synergy_heatmap(decoder, names, folder / "synergies.png")
+
+    actions, gmvae = stage.actions(), stage.gmvae
+    dims = sorted({d for d in (*dims, gmvae.latent_dim) if d <= gmvae.action_dim})
+    series: dict[str, list[float]] = {"GMVAE": [], "PCA": [], "NMF": []}
+    with torch.random.fork_rng():
+        for d in dims:
+            model = gmvae
+            if d != gmvae.latent_dim:
+                model = GMVAE(gmvae.action_dim, d, low=gmvae.low, high=gmvae.high).to(actions)
+                fit_gmvae(model, actions, updates=updates)
+            with torch.no_grad():
+                series["GMVAE"].append(variance_accounted_for(actions, model.reconstruct(actions)))
+            series["PCA"].append(pca_vaf(actions, d))
+            series["NMF"].append(nmf_vaf(actions, d, low=gmvae.low))
+    vaf_curve(dims, series, folder / "vaf.png", chosen_d=gmvae.latent_dim)
+
+    visited = stage.buffer.storage[:][-5000:]
+    with torch.no_grad():
+        embedded = stage.encoder(visited.select("observation"))["embedding"]
+    embedding(embedded, visited["direction"], folder / "embedding.png")
+
+
+def describe_in_words(numbers: dict[str, Any]) -> str:
+    """One line about a synergy space."""
+    return (
+        f"variance accounted for {numbers['vaf']:.3f} (PCA {numbers['pca_vaf']:.3f}, "
+        f"NMF {numbers['nmf_vaf']:.3f}), control authority {numbers['control_authority']:.2f}"
+    )

@@ -1,0 +1,74 @@
+"""Episodes as MP4, drawn by MuJoCo's own renderer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v2 as imageio
+import mujoco
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+from torchrl_etl.envs import mujoco_state
+from torchrl_etl.training.evaluation import EVALUATION_SEED
+
+__all__ = ["record_episodes"]
+
+
+def record_episodes(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    folder: Path,
+    *,
+    episodes: int,
+    size: tuple[int, int] = (480, 640),
+    max_steps: int = 1000,
+) -> list[Path]:
+    """Render the deterministic policy on the first evaluation seeds.
+
+    Args:
+        env (EnvBase): a single environment on MuJoCo, transforms included.
+        policy (TensorDictModuleBase): the policy.
+        folder (path): where ``episode0.mp4`` and so on go.
+
+    Keyword Args:
+        episodes (int): number of episodes.
+        size (tuple of int): height and width in pixels.
+        max_steps (int): where to cut an episode that does not end.
+
+    Raises:
+        RuntimeError: if the machine has no way to draw, naming what to install.
+    """
+    model, data = mujoco_state(env)
+    # The default frame buffer of most models is smaller than a readable picture.
+    model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
+    try:
+        renderer = mujoco.Renderer(model, *size)
+    except Exception as error:  # the GL back ends share no base class
+        raise RuntimeError(
+            f"MuJoCo cannot draw here ({type(error).__name__}: {error}); install a GL back end "
+            "(Debian: apt-get install libegl1, or libosmesa6 for software rendering) and set "
+            "MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+        ) from error
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    with (
+        renderer,
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+    ):
+        for episode in range(episodes):
+            frames: list[np.ndarray] = []
+
+            def draw(*_: object, frames: list[np.ndarray] = frames) -> None:
+                renderer.update_scene(data)
+                frames.append(renderer.render())
+
+            env.set_seed(EVALUATION_SEED + episode)
+            env.rollout(max_steps, policy, callback=draw)
+            paths.append(folder / f"episode{episode}.mp4")
+            imageio.mimwrite(paths[-1], frames, fps=25, macro_block_size=1)
+    return paths

@@ -1,0 +1,147 @@
+"""The direction z_sp that an episode of the explore stage follows through embedding space."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import TensorDictPrimer
+
+from torchrl_etl.modules.checks import check_positive
+
+__all__ = ["DirectionPrimer"]
+
+
+class DirectionPrimer(TensorDictPrimer):
+    """Draws a unit vector at the start of each episode and keeps it until the end.
+
+    Works on single, serial, parallel and vectorized envs without being told the batch size. At a
+    partial reset only the envs that start anew get a new direction. Draws come from torch's global
+    generator. TorchRL does not seed it in worker processes until ``set_seed`` is called on the
+    batched env or collector: without that call workers can draw identical directions.
+
+    Called on a tensordict outside an env (in an ``nn.Sequential``, on a replay buffer's sample
+    path) it draws one direction per element where none is present, and leaves present ones alone.
+
+    Equation: z_sp of Eq. 1.
+
+    Deviates: the paper says both "d unit vectors" (a finite set) and "sample unit latent vector"
+    (Algorithm 1). The default is the sphere; ``kind="orthonormal"`` is the finite set.
+
+    Args:
+        embedding_dim (int): size k of the direction, which is the size of the state embedding.
+
+    Keyword Args:
+        kind (str): ``"sphere"`` draws uniformly on the unit sphere (±1 where k is 1),
+            ``"orthonormal"`` picks one of the first ``num_directions`` unit vectors of the
+            standard basis. Default: ``"sphere"``.
+        num_directions (int, optional): size of the orthonormal set, at most k. Default: k.
+        out_key (NestedKey): Default: ``"direction"``.
+
+    Keys:
+        writes ``direction`` [*, k], unit norm, entries in [-1, 1], at reset; it is carried to
+        ``("next", "direction")`` at every step.
+
+    Raises:
+        ValueError: if a size is not positive, the kind is unknown, or ``num_directions`` does not
+            fit the kind or exceeds k.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
+        >>> from torchrl_etl.transforms import DirectionPrimer
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), DirectionPrimer(4))
+        >>> direction = env.rollout(3)["direction"]
+        >>> direction.shape, bool((direction == direction[0]).all())
+        (torch.Size([3, 4]), True)
+        >>> primer = DirectionPrimer(4, kind="orthonormal", num_directions=2)
+        >>> env = TransformedEnv(SerialEnv(2, lambda: GymEnv("Pendulum-v1")), primer)
+        >>> env.reset()["direction"].sum(-1)
+        tensor([1., 1.])
+    """
+
+    def __init__(
+        self,
+        embedding_dim: int,
+        *,
+        kind: Literal["sphere", "orthonormal"] = "sphere",
+        num_directions: int | None = None,
+        out_key: NestedKey = "direction",
+    ) -> None:
+        check_positive(embedding_dim=embedding_dim)
+        if kind not in ("sphere", "orthonormal"):
+            raise ValueError(f"kind is {kind!r}; choose 'sphere' or 'orthonormal'.")
+        if kind == "sphere" and num_directions is not None:
+            raise ValueError(
+                f"num_directions is {num_directions}, but a sphere has no finite set of "
+                "directions; pass kind='orthonormal' or drop num_directions."
+            )
+        num_directions = embedding_dim if num_directions is None else num_directions
+        check_positive(num_directions=num_directions)
+        if num_directions > embedding_dim:
+            raise ValueError(
+                f"num_directions is {num_directions}, but only {embedding_dim} orthonormal "
+                f"directions fit into {embedding_dim} dimensions; lower it or raise embedding_dim."
+            )
+        out_key = unravel_key(out_key)
+        super().__init__(
+            primers=Composite({out_key: Bounded(-1.0, 1.0, shape=(embedding_dim,))}),
+            expand_specs=True,
+        )
+        self.out_keys = [out_key]
+        self.embedding_dim, self.kind, self.num_directions = embedding_dim, kind, num_directions
+
+    def draw(self, batch_size: torch.Size, device: torch.device | None = None) -> Tensor:
+        """Unit vectors [*batch_size, k]."""
+        if self.kind == "orthonormal":
+            index = torch.randint(self.num_directions, batch_size, device=device)
+            return torch.nn.functional.one_hot(index, self.embedding_dim).to(self._leaf.dtype)
+        gauss = torch.randn(*batch_size, self.embedding_dim, device=device, dtype=self._leaf.dtype)
+        # Rounding can leave a lone large component one bit above 1, outside the spec.
+        return torch.nn.functional.normalize(gauss, dim=-1).clamp(-1.0, 1.0)
+
+    @property
+    def _leaf(self) -> Bounded:
+        return self.primers[self.out_keys[0]]
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        # The base class expands ``self.primers`` in place, which ties the transform to the first
+        # env it meets; ours stays unbatched, so a clone serves an env of another batch size.
+        leaf = self._leaf.expand(*observation_spec.shape, self.embedding_dim)
+        if observation_spec.device is not None:
+            leaf = leaf.to(observation_spec.device)
+        observation_spec[self.out_keys[0]] = leaf
+        return observation_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if tensordict.get(self.out_keys[0], None) is None:
+            self._reset_func(tensordict, tensordict)
+        return tensordict
+
+    def _reset_func(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # A draw for every env: at a partial reset the env keeps those of the envs that reset.
+        return tensordict_reset.set(
+            self.out_keys[0], self.draw(tensordict_reset.batch_size, tensordict_reset.device)
+        )
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Here nobody merges by the reset mask for us.
+        present = tensordict.get(self.out_keys[0])
+        reset = tensordict.get(self.reset_key)
+        fresh = self._reset_func(tensordict, tensordict_reset).get(self.out_keys[0])
+        reset = expand_as_right(reset.reshape(tensordict.batch_size), fresh)
+        return tensordict_reset.set(self.out_keys[0], torch.where(reset, fresh, present))
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}(embedding_dim={self.embedding_dim}, kind={self.kind!r}, "
+            f"num_directions={self.num_directions}, out_key={self.out_keys[0]!r})"
+        )

@@ -1,0 +1,253 @@
+"""Eq. 1 as a transform: the reward for moving along the episode's direction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from torchrl_etl.functional import direction_bonus
+
+__all__ = ["IntrinsicReward"]
+
+
+class _RunningDeviation(nn.Module):
+    """Exponentially weighted mean and variance of a scalar, free of start-up bias.
+
+    Weights are those of a bias-corrected moving average: the first update counts fully.
+    """
+
+    # A bonus that hardly varies is scaled up to ten times its root mean square, not to infinity.
+    _FLOOR = 0.1
+    _EPSILON = 1e-6
+
+    def __init__(self, decay: float) -> None:
+        super().__init__()
+        self.decay = decay
+        self.register_buffer("mean", torch.zeros(()))
+        # Never averaged in (the first update has full weight): it makes an unused divisor 1.
+        self.register_buffer("variance", torch.ones(()))
+        self.register_buffer("weight", torch.zeros(()))
+
+    def update(self, values: Tensor) -> None:
+        self.weight.mul_(self.decay).add_(1 - self.decay)
+        step = (1 - self.decay) / self.weight
+        change = values.mean() - self.mean
+        self.mean.add_(step * change)
+        between = step * change.square()
+        self.variance.add_(between).mul_(1 - step).add_(step * values.var(correction=0))
+
+    @property
+    def divisor(self) -> Tensor:
+        floor = self._FLOOR**2 * (self.variance + self.mean.square())
+        return torch.maximum(self.variance, floor).sqrt().clamp_min(self._EPSILON)
+
+
+class IntrinsicReward(Transform):
+    """Rewards movement of the state embedding along the direction of the episode.
+
+    The same class works in three places:
+
+    - on an env: every step writes the bonus, for logging or on-policy learners. The env's state
+      spec then holds the observation and the direction, because a step needs both;
+    - on a replay buffer: every *sampled* batch gets the bonus of the current encoder, so that the
+      reward is never stale. Nothing is written when the buffer is extended;
+    - called on a tensordict with root and ``"next"`` entries, any batch size, time included.
+
+    The encoder is held by reference and belongs to whoever trains it: the transform evaluates it
+    without gradients on the encoder's own device and never copies, moves, freezes or switches it
+    between train and eval mode, and ``state_dict()`` holds the running statistics only. In another
+    process the encoder is the copy made when the worker started.
+
+    Equation: 1, r^b = ⟨φ(s') - φ(s), z_sp⟩.
+
+    Deviates: the print uses the bare bonus, whose scale drifts with φ. By default it is divided by
+    its running standard deviation (no mean is subtracted: the sign says towards or away), and by
+    no less than a tenth of its root mean square; ``normalize=False`` is the print. The reward of
+    stage 1 is the bonus alone, as in Algorithm 1; ``extrinsic_weight=1`` is the text's r^e + r^b.
+
+    Args:
+        encoder (TensorDictModuleBase): φ, with one in-key and one out-key. Its own key names need
+            not be those of the data.
+
+    Keyword Args:
+        in_keys (sequence of NestedKey): keys of observation and direction. Default:
+            ``("observation", "direction")``.
+        out_key (NestedKey): Default: ``"intrinsic_reward"``.
+        normalize (bool): divide the bonus by its running standard deviation. Default: ``True``.
+        decay (float): in (0, 1); a call (one env step or one sampled batch) weighs ``1 - decay`` in
+            the running statistics. Default: 0.99.
+        extrinsic_weight (float): weight of the task's reward, added after the division.
+            Default: 0.
+        reward_key (NestedKey): the task's reward, read where ``extrinsic_weight`` is not 0.
+            Default: ``"reward"``.
+        update_statistics (bool): whether calls update the running statistics; an attribute of the
+            same name can be set at any time. It does not depend on train and eval mode, since
+            TorchRL puts transforms of envs and buffers in eval mode. Default: ``True``.
+
+    Keys:
+        reads ``observation`` [*, O], ``direction`` [*, k], ``("next", "observation")`` and, with an
+        extrinsic weight, ``("next", "reward")`` [*, 1]; writes ``("next", "intrinsic_reward")``
+        [*, 1], unbounded, in standard deviations where normalized.
+
+    Raises:
+        TypeError: if the encoder has no in- and out-keys.
+        ValueError: if the encoder has several of them, ``in_keys`` is not a pair, or ``decay`` is
+            outside (0, 1); at the first call if embedding and direction differ in size.
+        KeyError: if an input is in neither the tensordict nor the specs of the env.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.modules import StateEncoder
+        >>> from torchrl_etl.transforms import IntrinsicReward
+        >>> encoder = StateEncoder(observation_dim=3, embedding_dim=2)
+        >>> bonus = IntrinsicReward(encoder)
+        >>> data = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 3),
+        ...         "direction": torch.eye(2)[torch.randint(2, (8,))],
+        ...         "next": {"observation": torch.randn(8, 3)},
+        ...     },
+        ...     [8],
+        ... )
+        >>> bonus(data)["next", "intrinsic_reward"].shape
+        torch.Size([8, 1])
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_etl.transforms import DirectionPrimer
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), DirectionPrimer(2))
+        >>> rollout = env.append_transform(IntrinsicReward(encoder)).rollout(5)
+        >>> rollout["next", "intrinsic_reward"].shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        encoder: TensorDictModuleBase,
+        *,
+        in_keys: Sequence[NestedKey] = ("observation", "direction"),
+        out_key: NestedKey = "intrinsic_reward",
+        normalize: bool = True,
+        decay: float = 0.99,
+        extrinsic_weight: float = 0.0,
+        reward_key: NestedKey = "reward",
+        update_statistics: bool = True,
+    ) -> None:
+        if not (hasattr(encoder, "in_keys") and hasattr(encoder, "out_keys")):
+            raise TypeError(
+                f"The encoder is a {type(encoder).__name__} without in_keys and out_keys; wrap it "
+                "in a tensordict.nn.TensorDictModule."
+            )
+        if len(encoder.in_keys) != 1 or len(encoder.out_keys) != 1:
+            raise ValueError(
+                f"The encoder reads {list(encoder.in_keys)} and writes {list(encoder.out_keys)}; "
+                "it must read one observation and write one embedding."
+            )
+        if isinstance(in_keys, str) or len(in_keys) != 2:
+            raise ValueError(
+                f"in_keys is {in_keys!r}; pass a pair of keys, the observation and the direction."
+            )
+        if not 0.0 < decay < 1.0:
+            raise ValueError(f"decay is {decay}; it must lie strictly between 0 and 1.")
+        super().__init__(in_keys=list(in_keys), out_keys=[out_key])
+        # Outside the module list: as a submodule the encoder would follow the env's device, be put
+        # in eval mode under the learner's feet, and be saved twice.
+        self.__dict__["_encoder"] = encoder
+        self.deviation = _RunningDeviation(decay) if normalize else None
+        self.extrinsic_weight = extrinsic_weight
+        self.reward_key = unravel_key(reward_key)
+        self.update_statistics = update_statistics
+
+    @property
+    def encoder(self) -> TensorDictModuleBase:
+        """The encoder given at construction, not a copy."""
+        return self._encoder
+
+    @torch.no_grad()
+    def _reward(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+        observation_key, direction_key = self.in_keys
+        observation = self._read(tensordict, observation_key)
+        direction = self._read(tensordict, direction_key)
+        next_observation = self._read(next_tensordict, observation_key, "next")
+        parameter = next(iter(self.encoder.parameters()), direction)
+        # One pass through the encoder for both ends of the transition.
+        ends = TensorDict(
+            {self.encoder.in_keys[0]: torch.stack([observation, next_observation])},
+            [2, *tensordict.batch_size],
+            device=parameter.device,
+        )
+        embedding, next_embedding = self.encoder(ends).get(self.encoder.out_keys[0]).unbind(0)
+        if embedding.shape[-1] != direction.shape[-1]:
+            raise ValueError(
+                f"The encoder's embedding has {embedding.shape[-1]} dimensions but "
+                f"{direction_key!r} has {direction.shape[-1]}; give DirectionPrimer and encoder "
+                "the same embedding_dim."
+            )
+        bonus = direction_bonus(embedding, next_embedding, direction.to(embedding.device))
+        bonus = bonus.to(direction.device)
+        if self.deviation is not None:
+            if self.deviation.mean.device != bonus.device:
+                self.deviation.to(bonus.device)
+            if self.update_statistics:
+                self.deviation.update(bonus)
+            bonus = bonus / self.deviation.divisor
+        if self.extrinsic_weight:
+            reward = self._read(next_tensordict, self.reward_key, "next")
+            bonus = bonus + self.extrinsic_weight * reward
+        return bonus
+
+    @staticmethod
+    def _read(tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(
+                f"IntrinsicReward reads {unravel_key((*prefix, key))!r}, which the data lacks; "
+                f"beside it are {sorted(map(str, tensordict.keys(True, True)))}."
+            )
+        return value
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict = tensordict.get("next", None)
+        if next_tensordict is None:
+            raise KeyError(
+                "IntrinsicReward needs whole transitions, but the tensordict has no 'next' entry; "
+                "call it on data from a rollout, a collector or a replay buffer."
+            )
+        reward = self._reward(tensordict, next_tensordict)
+        return tensordict.set(unravel_key(("next", self.out_keys[0])), reward)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.out_keys[0], self._reward(tensordict, next_tensordict))
+
+    def transform_state_spec(self, state_spec: Composite | None) -> Composite:
+        # A parallel env hands its workers the action and what the state spec names, no more:
+        # without these entries a worker would take the root of its own last step for the caller's.
+        if state_spec is None:
+            state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
+        for key in self.in_keys:
+            if key not in state_spec.keys(True, True):
+                state_spec[key] = self._observation_leaf(key).clone()
+        return state_spec
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        direction = self._observation_leaf(self.in_keys[1])
+        reward_spec[self.out_keys[0]] = Unbounded(
+            shape=(*direction.shape[:-1], 1), dtype=direction.dtype, device=direction.device
+        )
+        return reward_spec
+
+    def _observation_leaf(self, key: NestedKey) -> Unbounded:
+        observation_spec = self.parent.full_observation_spec
+        if key not in observation_spec.keys(True, True):
+            raise KeyError(
+                f"IntrinsicReward reads {key!r}, but the env's observations are "
+                f"{sorted(map(str, observation_spec.keys(True, True)))}; put the transform that "
+                "writes it (DirectionPrimer for the direction) before IntrinsicReward."
+            )
+        return observation_spec[key]
