@@ -46,15 +46,15 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     lines = [
         "",
         f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}",
-        f"  synergies  variance accounted for {synergies['vaf']:.3f} (PCA "
+        f"  {'synergies':<11}variance accounted for {synergies['vaf']:.3f} (PCA "
         f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
         f"control authority {synergies['control_authority']:.2f}",
     ]
-    for key in ("return", "solved"):
+    for key in ("return", "solved", "solved_time"):
         if key in learned:
             value = learned[key]
             lines.append(
-                f"  {key:<9}  {value['before']:.2f} before, {value['after']:.2f} after "
+                f"  {key:<11}{value['before']:.2f} before, {value['after']:.2f} after "
                 f"(95% interval {value['low']:.2f} to {value['high']:.2f}, "
                 f"{learned['frames_charged']:,} frames)"
             )

@@ -28,13 +28,15 @@ def main(config: DictConfig) -> None:
         experiment = Experiment(trained, resume=run)
         stage = experiment.learned()
     evaluation = experiment.evaluator(stage)()
-    result = {"env": trained.env, "goal": trained.goal, **evaluation.summary()}
+    result = {"env": trained.env, "goal": experiment.task.goal, **evaluation.summary()}
     path = experiment.folder.write_json("evaluation.json", result)
-    print(f"{trained.env} ({trained.goal} goal), {config.episodes} episodes, deterministic policy")
-    for key in ("return", "solved"):
+    print(
+        f"{trained.env} ({experiment.task.goal} goal), {config.episodes} episodes, deterministic policy"
+    )
+    for key in ("return", "solved", "solved_time"):
         if key in result:
             mean, low, high = result[key].values()
-            print(f"  {key:<7} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+            print(f"  {key:<11} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
     print(f"  written to {path}")
     if config.video:
         with one_sentence(RuntimeError):

@@ -292,6 +292,17 @@ class LossChecks(ABC):
                     expected = (old[name].get(key) + source.get(key).detach()) / 2
                     torch.testing.assert_close(value.detach(), expected)
 
+    def test_every_target_is_read(self) -> None:
+        loss, data = self.built(), self.data()
+        for name in self.targets:
+            before = self.losses(self.seeded(loss, data))
+            with torch.no_grad():
+                for value in getattr(loss, name).values(True, True):
+                    if value.is_floating_point():
+                        value.mul_(1.5)
+            after = self.losses(self.seeded(loss, data))
+            assert any((before[key] != after[key]).any() for key in before), name
+
     def test_is_a_tensordict_module_with_key_lists(self) -> None:
         loss = self.built()
         assert isinstance(loss, TensorDictModuleBase)

@@ -17,6 +17,7 @@ from tests.loss_checks import LossChecks
 from torchrl_etl.functional import encoder_loss
 from torchrl_etl.modules import GaussianDynamics, StateEncoder
 from torchrl_etl.objectives import BehavioralMetricLoss
+from torchrl_etl.objectives.behavioral_metric import _dynamics_nll
 
 OBSERVATION_DIM, EMBEDDING_DIM = 5, 3
 
@@ -184,22 +185,43 @@ def test_reward_scale_sets_the_unit_and_is_saved() -> None:
     assert other.reward_scale.item() == 10.0
 
 
-def test_gaussian_divergence_by_hand() -> None:
-    class Dynamics(nn.Module):
-        def forward(self, embedding: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            return 2 * embedding, torch.ones_like(embedding)
+class Doubling(nn.Module):
+    def forward(self, embedding: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return 2 * embedding, torch.ones_like(embedding)
 
-    dynamics = TensorDictModule(Dynamics(), in_keys=["x"], out_keys=["mean", "std"])
-    loss = BehavioralMetricLoss(
+
+def gaussian_loss() -> BehavioralMetricLoss:
+    dynamics = TensorDictModule(Doubling(), in_keys=["x"], out_keys=["mean", "std"])
+    return BehavioralMetricLoss(
         table(*ROWS), dynamics, divergence="gaussian", gamma=0.5, regularizer="none"
     )
-    out = loss(transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3))
+
+
+def test_gaussian_divergence_by_hand() -> None:
+    out = gaussian_loss()(transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3))
     # Means (0, 0) and (6, 8), equal spread: W2 = 10.
     assert out["loss_metric"].item() == pytest.approx(0.5 * (5 - 1 - 0.5 * 10) ** 2, rel=1e-4)
     # Next embeddings (3, 4) and (0, 6) under those means.
     square = (9 + 16 + 36 + 4) / 2
     log_two_pi = torch.log(torch.tensor(2 * torch.pi)).item()
     assert out["loss_dynamics"].item() == pytest.approx(0.5 * square + log_two_pi, rel=1e-5)
+
+
+def test_gaussian_divergence_lives_in_the_targets_space() -> None:
+    loss = gaussian_loss()
+    for value in loss.target_encoder_params.values(True, True):
+        value.mul_(2.0)
+    out = loss(transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3))
+    assert out["loss_metric"].item() == pytest.approx(0.5 * (5 - 1 - 0.5 * 20) ** 2, rel=1e-4)
+
+
+def test_dynamics_gradients_do_not_explode_where_the_spread_is_small() -> None:
+    loc = torch.tensor([1.0, 1.0], requires_grad=True)
+    scale = torch.tensor([0.5, 1e-3], requires_grad=True)
+    _dynamics_nll(torch.tensor([2.0, 1.1]), loc, scale).backward()
+    # -error / scale where the plain likelihood has -error / scale ** 2.
+    torch.testing.assert_close(loc.grad, torch.tensor([-2.0, -100.0]), rtol=1e-3, atol=0.0)
+    torch.testing.assert_close(scale.grad, torch.tensor([-3.0, -9999.0]), rtol=1e-3, atol=0.0)
 
 
 @pytest.mark.parametrize("divergence", ["sampled", "gaussian"])

@@ -117,14 +117,15 @@ def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatc
     experiment = Experiment(tiny(f"run_dir='{run}'"))
     stage = experiment.explore_stage()
     monkeypatch.setattr(experiment, "explore_stage", lambda: stage)
-    update = stage.update
+    collect = stage.collect
 
-    def update_and_signal():
+    def collect_and_signal():
+        batch = collect()
         if stage.progress.frames == 224:
             os.kill(os.getpid(), number)
-        return update()
+        return batch
 
-    monkeypatch.setattr(stage, "update", update_and_signal)
+    monkeypatch.setattr(stage, "collect", collect_and_signal)
     with pytest.raises(Interrupted):
         experiment.run()
     assert (run / "checkpoints/explore/checkpoint-000000000224/seal.json").exists()

@@ -251,8 +251,8 @@ def synergy_warnings(
         pca_vaf (float): variance that PCA accounts for with as many dimensions.
         authority (Tensor or array): what :func:`control_authority` returned [n].
         usage (MixtureUsage, optional): what :func:`mixture_usage` returned.
-        min_vaf (float): a lower PCA variance means that the actions have no low-dimensional
-            structure. Default: 0.5.
+        min_vaf (float): least acceptable share of the variance, by the GMVAE or by PCA.
+            Default: 0.5.
         pca_tolerance (float): how far the GMVAE may stay behind PCA. Default: 0.02.
         min_authority (float): lowest acceptable mean authority. Default: 0.2.
         min_components (float): lowest acceptable effective number of components. Default: 1.5.
@@ -270,10 +270,11 @@ def synergy_warnings(
         the GMVAE longer, on actions that vary more.
     """
     found = []
-    if pca_vaf < min_vaf:
+    if max(vaf, pca_vaf) < min_vaf:
         found.append(
-            f"The actions hardly have synergies: PCA accounts for {pca_vaf:.0%} of their variance "
-            f"with as many dimensions ({min_vaf:.0%} is the least advised); fit on the policy's "
+            f"The actions hardly have synergies: the GMVAE accounts for {vaf:.0%} of their "
+            f"variance and PCA for {pca_vaf:.0%} ({min_vaf:.0%} is the least advised); fit on the "
+            "policy's "
             "mean actions or on muscle activations instead of sampled actions, or raise the number "
             "of synergies."
         )

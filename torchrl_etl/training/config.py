@@ -15,7 +15,6 @@ __all__ = ["resumed_config", "validate"]
 
 _CHOICES = {
     "stage": ("explore", "learn", "all"),
-    "goal": ("fixed", "random"),
     "explore.fit.actions": ("mean", "sampled", "activation"),
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
 }

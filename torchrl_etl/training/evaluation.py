@@ -20,26 +20,51 @@ SOLVED_STEPS = 5
 
 
 class Evaluation(NamedTuple):
-    """Episodes of one policy: undiscounted returns [E], lengths [E], and solved [E] or None."""
+    """Episodes of one policy: undiscounted returns [E], lengths [E], solved steps [E] or None.
+
+    ``time_limit`` is the length of a full episode.
+    """
 
     returns: list[float]
     lengths: list[int]
-    solved: list[bool] | None
+    solved_steps: list[int] | None
+    time_limit: int
 
     @property
     def mean_return(self) -> Interval:
         return interval(self.returns)
 
     @property
-    def solved_share(self) -> Interval | None:
-        return None if self.solved is None else success_interval(self.solved)
+    def solved(self) -> Interval | None:
+        """Share of episodes that MyoSuite counts as solved.
+
+        On its walking tasks a step is "solved" while the speed is near the target, as it also is
+        in falling forward; read :attr:`solved_time` there.
+        """
+        if self.solved_steps is None:
+            return None
+        return success_interval([steps > SOLVED_STEPS for steps in self.solved_steps])
+
+    @property
+    def solved_time(self) -> Interval | None:
+        """Share of a full episode's steps that were solved."""
+        if self.solved_steps is None:
+            return None
+        return interval([steps / self.time_limit for steps in self.solved_steps])
+
+    def intervals(self) -> dict[str, Interval]:
+        """By name, those that the environment defines."""
+        named = {
+            "return": self.mean_return,
+            "solved": self.solved,
+            "solved_time": self.solved_time,
+        }
+        return {name: value for name, value in named.items() if value is not None}
 
     def summary(self) -> dict[str, object]:
         """JSON-able: intervals, and every episode's own numbers."""
-        summary: dict[str, object] = {"return": self.mean_return._asdict()}
-        if self.solved_share is not None:
-            summary["solved"] = self.solved_share._asdict()
-        return {**summary, "episodes": self._asdict(), "first_seed": EVALUATION_SEED}
+        intervals = {name: value._asdict() for name, value in self.intervals().items()}
+        return {**intervals, "episodes": self._asdict(), "first_seed": EVALUATION_SEED}
 
 
 def evaluate(
@@ -80,5 +105,5 @@ def evaluate(
             returns.append(rollout["next", "reward"].sum().item())
             lengths.append(rollout.shape[-1])
             if "solved" in rollout["next"].keys():
-                solved.append(rollout["next", "solved"].sum().item() > SOLVED_STEPS)
-    return Evaluation(returns, lengths, solved or None)
+                solved.append(rollout["next", "solved"].sum().item())
+    return Evaluation(returns, lengths, solved or None, max_steps)

@@ -55,6 +55,7 @@ class Experiment:
         validate(config)
         self.config, self.say = config, say
         self.device = torch.device(config.device)
+        self.task = resolve_task(config.env, config.goal)
         self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
@@ -75,7 +76,7 @@ class Experiment:
             torch.set_num_threads(self.config.threads)
         summary: dict[str, Any] = {
             "env": self.config.env,
-            "goal": self.config.goal,
+            "goal": self.task.goal,
             "seed": self.config.seed,
         }
         with StopOnSignal() as stop:
@@ -117,11 +118,13 @@ class Experiment:
         for warning in warnings:
             self.say(f"Warning: {warning}")
         if self.config.pictures:
-            draw_synergies(stage, decoder, self.actuators, self.folder.pictures)
+            draw_synergies(
+                stage, decoder, self.actuators, self.folder.pictures, **self.config.vaf_curve
+            )
         save_bundle(
             decoder,
             self.folder.synergies,
-            task=resolve_task(self.config.env, self.config.goal).id,
+            task=self.task.env_id,
             actuators=self.actuators,
             num_components=stage.gmvae.num_components,
             facts={**numbers, "seed": self.config.seed, **facts()},
@@ -192,15 +195,14 @@ class Experiment:
         if self.config.pictures:
             self._draw_curves(charged)
         summary: dict[str, Any] = {"frames": stage.frames, "frames_charged": charged + stage.frames}
-        for key, value in (("return", after.mean_return), ("solved", after.solved_share)):
-            if value is not None:
-                before = self.folder.series(f"learn/eval/{key}")[1]
-                summary[key] = {
-                    "before": before[0] if before else math.nan,
-                    "after": value.mean,
-                    "low": value.low,
-                    "high": value.high,
-                }
+        for key, value in after.intervals().items():
+            before = self.folder.series(f"learn/eval/{key}")[1]
+            summary[key] = {
+                "before": before[0] if before else math.nan,
+                "after": value.mean,
+                "low": value.low,
+                "high": value.high,
+            }
         return summary
 
     def _draw_curves(self, charged: int) -> None:
@@ -214,7 +216,7 @@ class Experiment:
             rows,
             self.folder.pictures / "learning_curves.png",
             explore_frames=charged or None,
-            title=f"{self.config.env} ({self.config.goal} goal)",
+            title=f"{self.config.env} ({self.task.goal} goal)",
         )
 
     # Shared ------------------------------------------------------------------------------------

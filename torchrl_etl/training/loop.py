@@ -167,10 +167,10 @@ class _Report:
         self.forget_open_window()
 
     def evaluation(self, evaluation: Evaluation) -> None:
-        values = {"eval/return": evaluation.mean_return.mean}
-        if evaluation.solved_share is not None:
-            values["eval/solved"] = evaluation.solved_share.mean
-            self._show(solved=f"{values['eval/solved']:.0%}")
+        means = {name: value.mean for name, value in evaluation.intervals().items()}
+        values = {f"eval/{name}": mean for name, mean in means.items()}
+        if "solved" in means:
+            self._show(solved=f"{means['solved']:.0%}")
         self._show(eval=f"{values['eval/return']:.1f}")
         self._log(values)
 

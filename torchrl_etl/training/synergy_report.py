@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -30,7 +29,7 @@ __all__ = ["describe_synergies", "draw_synergies", "fit_gmvae"]
 
 
 def fit_gmvae(
-    gmvae: GMVAE, actions: Tensor, *, updates: int, batch_size: int = 256, lr: float = 1e-3
+    gmvae: GMVAE, actions: Tensor, *, updates: int, batch_size: int = 256, lr: float = 3e-3
 ) -> GMVAE:
     """Train a GMVAE on an array of actions [N, n] by Eq. 9; returns it.
 
@@ -83,8 +82,8 @@ def draw_synergies(
     names: Sequence[str],
     folder: Path,
     *,
-    dims: Sequence[int] = (1, 2, 4, 8, 16),
-    updates: int = 500,
+    dims: Sequence[int],
+    updates: int,
 ) -> None:
     """Heat map over named muscles, VAF against d beside PCA and NMF, state embedding.
 
@@ -96,7 +95,8 @@ def draw_synergies(
 
     Keyword Args:
         dims (sequence of int): numbers of synergies on the VAF curve; those above n are left out.
-        updates (int): GMVAE updates for every other d than the stage's own.
+        updates (int): updates that a fresh GMVAE gets at every d, the same for all, so that the
+            curve compares dimensions and not training times; the stage's own had more.
     """
     synergy_heatmap(decoder, names, folder / "synergies.png")
 
@@ -105,12 +105,12 @@ def draw_synergies(
     series: dict[str, list[float]] = {"GMVAE": [], "PCA": [], "NMF": []}
     with torch.random.fork_rng():
         for d in dims:
-            model = gmvae
-            if d != gmvae.latent_dim:
-                model = GMVAE(gmvae.action_dim, d, low=gmvae.low, high=gmvae.high).to(actions)
-                fit_gmvae(model, actions, updates=updates)
+            fresh = GMVAE(
+                gmvae.action_dim, d, gmvae.num_components, low=gmvae.low, high=gmvae.high
+            ).to(actions.device)
+            fit_gmvae(fresh, actions, updates=updates)
             with torch.no_grad():
-                series["GMVAE"].append(variance_accounted_for(actions, model.reconstruct(actions)))
+                series["GMVAE"].append(variance_accounted_for(actions, fresh.reconstruct(actions)))
             series["PCA"].append(pca_vaf(actions, d))
             series["NMF"].append(nmf_vaf(actions, d, low=gmvae.low))
     vaf_curve(dims, series, folder / "vaf.png", chosen_d=gmvae.latent_dim)
@@ -119,11 +119,3 @@ def draw_synergies(
     with torch.no_grad():
         embedded = stage.encoder(visited.select("observation"))["embedding"]
     embedding(embedded, visited["direction"], folder / "embedding.png")
-
-
-def describe_in_words(numbers: dict[str, Any]) -> str:
-    """One line about a synergy space."""
-    return (
-        f"variance accounted for {numbers['vaf']:.3f} (PCA {numbers['pca_vaf']:.3f}, "
-        f"NMF {numbers['nmf_vaf']:.3f}), control authority {numbers['control_authority']:.2f}"
-    )
