@@ -46,7 +46,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     lines = [
         "",
         f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}",
-        f"  {'synergies':<11}variance accounted for {synergies['vaf']:.3f} (PCA "
+        f"  {'synergies':<12}variance accounted for {synergies['vaf']:.3f} (PCA "
         f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
         f"control authority {synergies['control_authority']:.2f}",
     ]
@@ -54,12 +54,13 @@ def report(summary: dict[str, Any], folder: Path) -> str:
         if key in learned:
             value = learned[key]
             lines.append(
-                f"  {key:<11}{value['before']:.2f} before, {value['after']:.2f} after "
+                f"  {key:<12}{value['before']:.2f} before, {value['after']:.2f} after "
                 f"(95% interval {value['low']:.2f} to {value['high']:.2f}, "
                 f"{learned['frames_charged']:,} frames)"
             )
-    lines += [f"  pictures   {folder / 'pictures'}", f"  all of it  {folder}"]
-    return "\n".join(lines)
+    if (folder / "pictures").exists():
+        lines.append(f"  pictures    {folder / 'pictures'}")
+    return "\n".join([*lines, f"  all of it   {folder}"])
 
 
 if __name__ == "__main__":

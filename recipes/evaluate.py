@@ -31,12 +31,13 @@ def main(config: DictConfig) -> None:
     result = {"env": trained.env, "goal": experiment.task.goal, **evaluation.summary()}
     path = experiment.folder.write_json("evaluation.json", result)
     print(
-        f"{trained.env} ({experiment.task.goal} goal), {config.episodes} episodes, deterministic policy"
+        f"{trained.env} ({experiment.task.goal} goal), deterministic policy, "
+        f"{config.episodes} episodes"
     )
     for key in ("return", "solved", "solved_time"):
         if key in result:
             mean, low, high = result[key].values()
-            print(f"  {key:<11} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
     print(f"  written to {path}")
     if config.video:
         with one_sentence(RuntimeError):

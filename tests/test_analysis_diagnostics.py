@@ -137,7 +137,10 @@ def test_each_fault_gets_its_own_sentence_with_its_numbers():
     even = MixtureUsage(torch.full((4,), 0.25), 4.0)
     assert synergy_warnings(**good, usage=even) == []
     faults = {
-        "hardly have synergies: PCA accounts for 18%": {"vaf": 0.18, "pca_vaf": 0.18},
+        "hardly have synergies: the GMVAE accounts for 18%": {
+            "vaf": 0.18,
+            "pca_vaf": 0.18,
+        },
         "60.0% of the actions' variance, less than PCA's 75.0%": {"vaf": 0.6},
         "over 5% of its range": {"authority": torch.tensor([0.0, 0.1])},
         "collapsed: 1.0 of its 4": {"usage": MixtureUsage(torch.eye(4)[0], 1.0)},

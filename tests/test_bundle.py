@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_etl.envs import actuator_names, make_env
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.bundle import (
     BundleError,
@@ -217,3 +218,22 @@ def test_other_bounds_are_refused(low, high, side):
     words = f"other {side} action bounds .* 5 of 5 actuators .'biceps'"
     with pytest.raises(BundleError, match=words):
         check_compatible(info(), NAMES, low, high)
+
+
+@pytest.mark.slow
+def test_synergies_of_hand_pose_fit_the_other_hand_tasks_and_no_leg(tmp_path):
+    spaces = {
+        task: (actuator_names(env), env.action_spec_unbatched.space)
+        for task in ("myoHandPose", "myoHandKeyTurn", "myoHandPenTwirl", "myoLegWalk")
+        for env in [make_env(task)]
+    }
+    names, space = spaces["myoHandPose"]
+    decoder = SynergyDecoder(4, 39, low=space.low.tolist(), high=space.high.tolist(), hidden=(8,))
+    folder = save_bundle(decoder, tmp_path / "b", task="myoHandPose", actuators=names)
+    described = load_bundle(folder)[1]
+    for task in ("myoHandPose", "myoHandKeyTurn", "myoHandPenTwirl"):
+        names, space = spaces[task]
+        check_compatible(described, names, space.low, space.high)
+    names, space = spaces["myoLegWalk"]
+    with pytest.raises(BundleError, match=r"with no name in common: it is for another body"):
+        check_compatible(described, names, space.low, space.high)

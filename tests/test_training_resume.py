@@ -17,6 +17,8 @@ import torch
 
 from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
+from torchrl_etl.training.checkpoints import Checkpoints, _digests
+from torchrl_etl.training.stage import Stage
 
 WALL_CLOCK = "frames_per_second"
 
@@ -48,6 +50,21 @@ def start(arguments: list[str], log: Path) -> subprocess.Popen:
         )
 
 
+def collected(monkeypatch, experiment: Experiment) -> int:
+    """Run an experiment; returns the frames that this process collected."""
+    frames = []
+    collect = Stage.collect
+
+    def counting(stage):
+        batch = collect(stage)
+        frames.append(len(batch))
+        return batch
+
+    monkeypatch.setattr(Stage, "collect", counting)
+    experiment.run()
+    return sum(frames)
+
+
 def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> None:
     deadline = time.monotonic() + seconds
     while not path.exists():
@@ -65,7 +82,9 @@ def uninterrupted(tmp_path_factory) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["explore", "learn"])
-def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(stage, tmp_path, uninterrupted):
+def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(
+    stage, tmp_path, monkeypatch, uninterrupted
+):
     run = tmp_path / "a run"  # with a space
     process = start(command(run), tmp_path / "log.txt")
     wait_for(run / "checkpoints" / stage / "checkpoint-000000000320" / "seal.json", process)
@@ -74,7 +93,8 @@ def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(stage, tmp_pat
     process.wait()
     assert not (run / "summary.json").exists()
 
-    Experiment(resumed_config(run), resume=run).run()
+    experiment = Experiment(resumed_config(run), resume=run)
+    assert collected(monkeypatch, experiment) < 2 * 608 - 300, "it went on, it did not start over"
     assert numbers(run) == uninterrupted
 
 
@@ -133,6 +153,32 @@ def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatc
     assert summary["learn"]["frames"] == 608
     frames, _ = experiment.folder.series("explore/updates")
     assert frames == sorted(set(frames)), "no frame is logged twice"
+
+
+def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_path):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'")).run()
+    for seal in (run / "checkpoints" / "learn").glob("*/seal.json"):
+        seal.write_text("{}")
+    with (
+        pytest.warns(UserWarning, match="is damaged"),
+        pytest.raises(OSError, match="move that folder away"),
+    ):
+        Experiment(resumed_config(run), resume=run).run()
+
+
+def test_a_checkpoint_that_could_run_code_is_not_loaded(tmp_path):
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    experiment.run()
+    newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
+    assert {path.suffix for path in newest.rglob("*") if path.is_file()} == {".json", ".memmap"}
+    (newest / "planted.pkl").write_bytes(b"not even read")
+    digests = _digests(newest)
+    (newest / "seal.json").write_text(json.dumps(digests))
+    with pytest.warns(UserWarning, match=r"planted\.pkl is not a kind of file"):
+        older = Checkpoints(newest.parent, keep_last=2).newest_whole()
+    assert older is not None and older != newest
 
 
 def test_a_longer_budget_can_be_given_when_resuming(tmp_path):

@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
+from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.envs.tasks import Goal, Task, resolve_task
 from torchrl_etl.envs.wrappers import (
     SUCCESS_KEYS,
@@ -126,24 +127,12 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
     """
     if isinstance(env, str):
         with quiet_compiler():
-            simulator = _simulator(resolve_task(env), {})[0]
+            built = _simulator(resolve_task(env), {})[0]
         try:
-            return actuator_names(simulator)
+            return actuator_names(built)
         finally:
-            simulator.close()
-    inner = env
-    while not isinstance(inner, gym.Env):
-        if isinstance(inner, gym.vector.VectorEnv):
-            inner = inner.unwrapped.envs[0]
-        elif isinstance(inner, GymWrapper):
-            inner = inner._env
-        elif hasattr(inner, "base_env"):
-            inner = inner.base_env
-        else:
-            raise ValueError(
-                f"Cannot read actuator names of a {type(env).__name__}; name the task."
-            )
-    names = _raw_actuator_names(inner.unwrapped)
+            built.close()
+    names = _raw_actuator_names(simulator(env))
     if all(name.endswith("_r") for name in names):
         return [name.removesuffix("_r") for name in names]
     return names

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from tensordict.nn import InteractionType, TensorDictModule, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
@@ -58,6 +59,11 @@ def make_actor(
         (torch.Size([3, 80]), True)
     """
     body = _body(sum(inputs.values()), 2 * action_spec.shape[-1], hidden, layer_norm)
+    # The means start near the middle of the bounds, so that whatever they later vary in was
+    # learned: in stage 1 the GMVAE would otherwise fit the noise of the initialisation.
+    with torch.no_grad():
+        body[-1].weight.mul_(0.01)
+        body[-1].bias.zero_()
     extractor = NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3)
     return ProbabilisticActor(
         TensorDictSequential(
@@ -90,4 +96,9 @@ def make_critic(
         >>> critic(data)["state_action_value"].shape
         torch.Size([3, 1])
     """
-    return ValueOperator(_body(sum(inputs.values()), 1, hidden, layer_norm), in_keys=list(inputs))
+    # Named here: ValueOperator calls it a state value unless a key is literally "action".
+    return ValueOperator(
+        _body(sum(inputs.values()), 1, hidden, layer_norm),
+        in_keys=list(inputs),
+        out_keys=["state_action_value"],
+    )

@@ -23,6 +23,20 @@ class Posterior(NamedTuple):
     scale: Tensor
 
 
+class _AtLeast(torch.autograd.Function):
+    """A lower bound whose gradient still passes where it pulls the input up, out of the bound."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, bound: float) -> Tensor:
+        ctx.save_for_backward(value >= bound)
+        return value.clamp_min(bound)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (inside,) = ctx.saved_tensors
+        return gradient * (inside | (gradient < 0)), None
+
+
 class ActionDecoder(nn.Module):
     """Dec: R^d → [low, high]^n, a multi-layer perceptron squashed into the action bounds.
 
@@ -35,7 +49,8 @@ class ActionDecoder(nn.Module):
         hidden (sequence of int): widths of the hidden layers. Default: ``(128, 128)``.
 
     Raises:
-        ValueError: if a size is not positive or a lower bound is not below its upper bound.
+        ValueError: if a size is not positive, a bound has another shape than [] or [n], or a lower
+            bound is not below its upper bound.
 
     Examples:
         >>> import torch
@@ -56,10 +71,14 @@ class ActionDecoder(nn.Module):
     ) -> None:
         super().__init__()
         check_positive(latent_dim=latent_dim, action_dim=action_dim)
-        low, high = (
-            torch.as_tensor(bound, dtype=torch.float32).expand(action_dim).clone()
-            for bound in (low, high)
-        )
+        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (low, high))
+        for bound in (low, high):
+            if bound.shape not in ((), (action_dim,)):
+                raise ValueError(
+                    f"An action bound has shape {tuple(bound.shape)} but there are {action_dim} "
+                    "actuators; pass one number, or one for each."
+                )
+        low, high = low.expand(action_dim).clone(), high.expand(action_dim).clone()
         if not (torch.isfinite(low) & torch.isfinite(high) & (low < high)).all():
             raise ValueError(
                 f"The action bounds are low={low.tolist()} and high={high.tolist()}; every lower "
@@ -168,18 +187,27 @@ class GMVAE(nn.Module):
     ) -> GMVAE:
         """Build for one (unbatched) bounded action spec, taking n and the bounds from it.
 
+        Raises:
+            ValueError: if the spec is not one leaf of shape [n].
+
         Examples:
             >>> from torchrl.data import Bounded
             >>> GMVAE.from_spec(Bounded(0, 1, shape=(80,)), latent_dim=4).high.max().item()
             1.0
         """
-        space = action_spec.space
+        space = getattr(action_spec, "space", None)
+        if not hasattr(space, "low") or len(action_spec.shape) != 1:
+            raise ValueError(
+                f"The action spec is a {type(action_spec).__name__} of shape "
+                f"{tuple(action_spec.shape)}; pass the bounded leaf of one environment, of shape "
+                "[n], such as env.action_spec_unbatched."
+            )
         return cls(
-            action_spec.shape[-1],
+            action_spec.shape[0],
             latent_dim,
             num_components,
-            low=space.low.flatten().tolist(),
-            high=space.high.flatten().tolist(),
+            low=space.low.tolist(),
+            high=space.high.tolist(),
             **kwargs,
         )
 
@@ -200,9 +228,10 @@ class GMVAE(nn.Module):
     def likelihood_scale(self) -> Tensor:
         """s [n], in units where the action bounds are [-1, 1].
 
-        Bounded below: on actions that d latents explain exactly the likelihood has no maximum.
+        Bounded below: on actions that d latents explain exactly the likelihood has no maximum. A
+        scale at its bound can grow again when the actions get more varied, as they do in stage 1.
         """
-        return self.likelihood_log_scale.clamp_min(-4.0).exp()
+        return _AtLeast.apply(self.likelihood_log_scale, -4.0).exp()
 
     def normalize(self, action: Tensor) -> Tensor:
         """Map actions [*, n] from [low, high] to [-1, 1]."""

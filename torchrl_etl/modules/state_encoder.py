@@ -25,7 +25,8 @@ class StateEncoder(TensorDictModule):
         embedding_dim (int): size k of the embedding.
 
     Keyword Args:
-        hidden (sequence of int): widths of the hidden layers. Default: ``(256, 256)``.
+        hidden (sequence of int): widths of the hidden layers, at least one.
+            Default: ``(256, 256)``.
         in_keys (sequence of NestedKey): the observation. Default: ``("observation",)``.
         out_keys (sequence of NestedKey): the embedding. Default: ``("embedding",)``.
 
@@ -33,7 +34,7 @@ class StateEncoder(TensorDictModule):
         reads ``observation`` [*, O]; writes ``embedding`` [*, k], unbounded.
 
     Raises:
-        ValueError: if a size is not positive.
+        ValueError: if a size is not positive or ``hidden`` is empty.
 
     Examples:
         >>> import torch
@@ -55,6 +56,10 @@ class StateEncoder(TensorDictModule):
         out_keys: Sequence[NestedKey] = ("embedding",),
     ) -> None:
         check_positive(observation_dim=observation_dim, embedding_dim=embedding_dim)
+        if not hidden:
+            raise ValueError(
+                "hidden is empty; give at least one width, for the layer that is normalized."
+            )
         first, *rest = hidden
         network = nn.Sequential(
             nn.Linear(observation_dim, first),

@@ -126,7 +126,7 @@ class SynergyDecoder(TensorDictModule):
             hidden=gmvae.decoder.hidden,
             residual=residual,
             **keys,
-        ).to(gmvae.low.device)
+        ).to(gmvae.low)  # device and dtype
         scaled = decoder.module
         scaled.decoder.load_state_dict(deepcopy(gmvae.decoder.state_dict()))
         with torch.no_grad():
@@ -134,9 +134,8 @@ class SynergyDecoder(TensorDictModule):
                 low = (gmvae.prior_loc - 2 * gmvae.prior_scale).amin(0)
                 high = (gmvae.prior_loc + 2 * gmvae.prior_scale).amax(0)
             else:
-                low, high = gmvae.infer(actions).quantile(
-                    torch.tensor([0.01, 0.99], device=actions.device), dim=0
-                )
+                latent = gmvae.infer(actions)
+                low, high = latent.quantile(latent.new_tensor([0.01, 0.99]), dim=0)
             scaled.center.copy_((high + low) / 2)
             scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
         return decoder

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from tensordict.utils import NestedKey
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
 from torchrl.objectives import SACLoss
+
+from torchrl_etl.objectives.checks import check_choice, check_parts
 
 __all__ = ["SynergySACLoss"]
 
@@ -21,7 +29,7 @@ class SynergySACLoss(SACLoss):
     targets stay right while the decoder moves, and the actor loss can carry the task's reward
     into the decoder.
 
-    Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL.
+    Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL, without a state-value network.
 
     Deviates: Eq. 10 alone brings no reward to the decoder (it regresses Dec(z) on a = Dec(z));
     with ``train_decoder=True`` the actor loss's gradient also reaches the decoder.
@@ -37,10 +45,14 @@ class SynergySACLoss(SACLoss):
             coefficients.
 
     Keys:
-        those of SACLoss, and the critics' action, root entry [*, n]: the executed one.
+        those of SACLoss, with the critics' action (root entry [*, n], the executed one) in place
+        of the policy's: recorded coefficients are not read. As SACLoss does, it writes
+        ``td_error`` [*] into its input.
 
     Raises:
-        ValueError: if the decoder does not join the actor's sample to the critics' input.
+        TypeError: if the decoder is not a TensorDict module, or a ``value_network`` is given.
+        ValueError: if the decoder does not join the actor's sample to the critics' input, or the
+            critics read the sample itself; for an unknown reduction.
 
     Examples:
         >>> import torch
@@ -57,7 +69,6 @@ class SynergySACLoss(SACLoss):
         >>> batch = TensorDict(
         ...     {
         ...         "observation": torch.randn(4, 3),
-        ...         "synergy": torch.zeros(4, 2),
         ...         "action": torch.zeros(4, 6),
         ...         "next": {
         ...             "observation": torch.randn(4, 3),
@@ -72,7 +83,23 @@ class SynergySACLoss(SACLoss):
         ['loss_actor', 'loss_alpha', 'loss_qvalue']
     """
 
+    @dataclass
+    class _AcceptedKeys(SACLoss._AcceptedKeys):
+        """SACLoss's keys; ``action`` is where the loss puts the coefficients it draws.
+
+        Attributes:
+            action (NestedKey): set to the actor's own key at construction; the default is
+                ``"synergy"``.
+        """
+
+        action: NestedKey = "synergy"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
     decoder_network: TensorDictModule
+    decoder_network_params: TensorDictParams
+    target_decoder_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -83,36 +110,79 @@ class SynergySACLoss(SACLoss):
         train_decoder: bool = True,
         **kwargs: Any,
     ) -> None:
-        (sampled,), (decoded,) = decoder.in_keys, decoder.out_keys
-        if sampled not in actor_network.out_keys or decoded not in qvalue_network.in_keys:
-            raise ValueError(
-                f"The decoder maps {sampled!r} to {decoded!r}, the actor writes "
-                f"{list(actor_network.out_keys)} and the critic reads "
-                f"{list(qvalue_network.in_keys)}; the decoder's input must be the actor's sample "
-                "and its output the critic's action."
+        check_parts("decoder", decoder, TensorDictModuleBase, outputs=1)
+        check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
+        if kwargs.get("value_network") is not None:
+            raise TypeError(
+                "value_network is given but SynergySACLoss bootstraps on its critics; leave it out."
             )
-        super().__init__(actor_network, qvalue_network, **kwargs)
-        self.decoded_key: NestedKey = decoded
+        sampled, decoded = list(actor_network.dist_sample_keys), list(decoder.out_keys)
+        if (
+            list(decoder.in_keys) != sampled
+            or len(decoded) != 1
+            or decoded[0] not in qvalue_network.in_keys
+        ):
+            raise ValueError(
+                f"The decoder maps {list(decoder.in_keys)} to {decoded}, the actor samples "
+                f"{sampled} and the critic reads {list(qvalue_network.in_keys)}; the decoder's one "
+                "input must be the actor's sample and its one output the critic's action."
+            )
+        self.decoded_key: NestedKey = decoded[0]
         self.train_decoder = train_decoder
+        super().__init__(actor_network, qvalue_network, **kwargs)
         self.convert_to_functional(decoder, "decoder_network", create_target_params=False)
+
+    def set_keys(self, **kwargs: NestedKey | None) -> None:
+        """See :meth:`torchrl.objectives.common.LossModule.set_keys`.
+
+        Raises:
+            ValueError: if ``action`` is a key that the critics read.
+        """
+        super().set_keys(**kwargs)
+        if self.tensor_keys.action in self.qvalue_network.in_keys:
+            raise ValueError(
+                f"The actor's sample goes to {self.tensor_keys.action!r}, which the critic reads "
+                f"(it reads {list(self.qvalue_network.in_keys)}): a replayed action could not be "
+                "told from a fresh one. Let the critic read the decoded action only."
+            )
+
+    def _set_in_keys(self) -> None:
+        observed = (
+            *self.actor_network.in_keys,
+            *(key for key in self.qvalue_network.in_keys if key != self.decoded_key),
+        )
+        ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        following = (unravel_key(("next", key)) for key in (*observed, *ends))
+        self._in_keys = list(dict.fromkeys((*observed, self.decoded_key, *following)))
+
+    @property
+    def _cached_detached_qvalue_params(self) -> TensorDictBase:
+        # SACLoss caches these, and a copy of a used loss then keeps the original's values.
+        return self.qvalue_network_params.detach()
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """See :meth:`torchrl.objectives.SACLoss.actor_loss`."""
+        # A shallow copy: the actor writes its loc and scale, graph and all, into what it reads.
+        return super().actor_loss(tensordict.copy())
 
     def _make_vmap(self) -> None:
         super()._make_vmap()
-        value = self._vmap_qnetworkN0
+        # A bound method and not a closure: a deep copy of the loss is then bound to the copy.
+        self._vmap_critics, self._vmap_qnetworkN0 = self._vmap_qnetworkN0, self._decode_then_value
 
-        def decode_then_value(data: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-            # SACLoss puts a sample here only when it is fresh; replayed transitions come with the
-            # critics' own keys alone, so their executed action is left as it is.
-            if self.tensor_keys.action in data.keys(True):
-                data = self._decode(data)
-            return value(data, params)
+    def _decode_then_value(self, data: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
+        # SACLoss puts a sample here only when it is fresh; replayed transitions come with the
+        # critics' own keys alone, so their executed action is left as it is.
+        if self.tensor_keys.action in data.keys(True):
+            data = data.copy().set(self.decoded_key, self._decode(data))
+        return self._vmap_critics(data, params)
 
-        self._vmap_qnetworkN0 = decode_then_value
-
-    def _decode(self, data: TensorDictBase) -> TensorDictBase:
-        params = self.decoder_network_params
+    def _decode(self, data: TensorDictBase) -> Tensor:
+        decoder, params = self.decoder_network, self.decoder_network_params
+        sample = TensorDict(
+            {decoder.in_keys[0]: data.get(self.tensor_keys.action)}, data.batch_size
+        )
         with (params if self.train_decoder else params.detach()).to_module(
-            self.decoder_network, preserve_module_state=False
+            decoder, preserve_module_state=False
         ):
-            decoded = self.decoder_network(data.select(self.tensor_keys.action))
-        return data.copy().set(self.decoded_key, decoded.get(self.decoded_key))
+            return decoder(sample).get(self.decoded_key)

@@ -55,10 +55,20 @@ class Checkpoints(CheckpointRotation):
         return None
 
     def load_newest_whole(self, checkpoint: Checkpoint) -> bool:
-        """Restore the newest whole checkpoint; False if there is none."""
+        """Restore the newest whole checkpoint; False if none was ever finished.
+
+        Raises:
+            OSError: if there are checkpoints and none is whole; beginning anew in their place
+                would delete what is left of them.
+        """
         folder = self.newest_whole()
         if folder is not None:
             checkpoint.load(folder)
+        elif any((path / _SEAL).exists() for path in self.checkpoints()):
+            raise OSError(
+                f"All checkpoints in {self.directory} are damaged; move that folder away to begin "
+                "this stage anew."
+            )
         return folder is not None
 
     def _remove_leftovers(self) -> None:

@@ -73,6 +73,8 @@ def validate(config: DictConfig) -> None:
             f"stage=explore finds synergies, but synergies={config.synergies} was given; leave it "
             "out or use stage=learn."
         )
+    for name in config.log:
+        check_choice("log", name, ("csv", "tensorboard", "wandb", "mlflow", "trackio"))
     _check_device(config.device)
 
 

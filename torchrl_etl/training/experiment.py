@@ -66,6 +66,7 @@ class Experiment:
                 f"num_synergies is {config.num_synergies} but {config.env} has "
                 f"{len(self.actuators)} actuators; choose at most that many."
             )
+        self._build_once()
         self.resume = resume is not None
         self.folder = RunFolder(resume or Path(config.run_dir), config)
 
@@ -88,7 +89,8 @@ class Experiment:
             decoder, info = self._decoder()
             summary["synergies"] = {"task": info.task, **info.facts}
             if self.config.stage != "explore":
-                summary["learn"] = self._learn(decoder, stop)
+                charged = info.facts["frames"] if self.config.synergies is None else 0
+                summary["learn"] = self._learn(decoder, charged, stop)
         self.folder.write_json("summary.json", {**summary, "versions": facts()})
         return summary
 
@@ -178,9 +180,8 @@ class Experiment:
             max_steps=steps,
         )
 
-    def _learn(self, decoder: SynergyDecoder, stop: StopOnSignal) -> dict[str, Any]:
+    def _learn(self, decoder: SynergyDecoder, charged: int, stop: StopOnSignal) -> dict[str, Any]:
         stage = self.learn_stage(decoder)
-        charged = self.config.explore.frames if self.config.synergies is None else 0
         evaluator = self.evaluator(stage)
         run_stage(
             stage,
@@ -239,6 +240,20 @@ class Experiment:
             "log_every": self.config.log_every,
             "show_progress": self.config.progress,
         }
+
+    def _build_once(self) -> None:
+        """Let every part object to its arguments now, not when its stage comes."""
+        if self.config.synergies is None:
+            self.explore_stage()
+        space = self.spec.full_action_spec_unbatched["action"].space
+        blank = SynergyDecoder(
+            self.config.num_synergies,
+            len(self.actuators),
+            low=space.low,
+            high=space.high,
+            residual=self.config.learn.residual,
+        )
+        self.learn_stage(blank)
 
     def _check_bundle(self, path: str) -> None:
         _, info = load_bundle(path)

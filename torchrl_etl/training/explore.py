@@ -45,7 +45,7 @@ class ExploreStage(Stage):
         spec (EnvBase): any instance of that environment, to read sizes and bounds from.
 
     Keyword Args:
-        num_synergies (int): d; also the embedding's size k unless ``encoder`` says otherwise.
+        num_synergies (int): d.
         network, encoder, direction, bonus, metric, gmvae, sac (mapping): keyword arguments of
             :func:`~torchrl_etl.modules.make_actor`/``make_critic``,
             :class:`~torchrl_etl.modules.StateEncoder`,
@@ -85,7 +85,6 @@ class ExploreStage(Stage):
         torch.manual_seed(stage["seed"])
         action_spec = spec.full_action_spec_unbatched["action"]
         observation_dim = spec.observation_spec["observation"].shape[-1]
-        encoder = {"embedding_dim": num_synergies, **encoder}
         inputs = {"observation": observation_dim, "direction": encoder["embedding_dim"]}
 
         actor = make_actor(inputs, action_spec, **network).to(device)
@@ -122,7 +121,9 @@ class ExploreStage(Stage):
             dynamics = GaussianDynamics(self.encoder.embedding_dim).to(device)
         self.metric = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(device)
         self.metric_optimizer = torch.optim.Adam(self.metric.parameters(), lr=encoder_lr)
-        self.metric_target = SoftUpdate(self.metric, tau=encoder_tau)
+        self.metric_target = (
+            SoftUpdate(self.metric, tau=encoder_tau) if metric["delay_encoder"] else None
+        )
 
         fit = dict(fit)
         self.fit_actions: GMVAEActions = fit.pop("actions")
@@ -155,7 +156,8 @@ class ExploreStage(Stage):
             self.metric_optimizer,
             *(value for key, value in metric.items() if key.startswith("loss_")),
         )
-        self.metric_target.step()
+        if self.metric_target is not None:
+            self.metric_target.step()
 
         gmvae = self.gmvae_loss(self._best(batch))
         gradient_step(self.gmvae_optimizer, gmvae["loss_gmvae"])

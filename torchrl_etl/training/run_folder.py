@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.training.checkpoints import write_atomically
 
-__all__ = ["RunFolder"]
+__all__ = ["RunFolder", "facts"]
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "myosuite", "dm-control")
 

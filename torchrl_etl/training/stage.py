@@ -16,6 +16,8 @@ from torchrl.collectors import Collector
 from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
+from torchrl_etl.training.buffer_adapter import BufferAdapter
+
 __all__ = ["Progress", "Stage", "entropy_target", "gradient_step"]
 
 
@@ -145,9 +147,8 @@ class Stage(ABC):
 
     def checkpoint(self) -> Checkpoint:
         """Everything the stage needs to go on, as a TorchRL checkpoint."""
-        return Checkpoint(
-            **self.parts(), buffer=self.buffer, progress=self.progress, rng=GlobalRNGState()
-        )
+        checkpoint = Checkpoint(**self.parts(), progress=self.progress, rng=GlobalRNGState())
+        return checkpoint.register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:
         if self.collector is not None:

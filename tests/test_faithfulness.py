@@ -1,0 +1,155 @@
+"""docs/faithfulness.md is complete, true to the configuration, and points at tests that exist."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from tests.configs import CONF, ROOT, tiny
+from torchrl_etl.training import Experiment
+from torchrl_etl.training.explore import ExploreStage
+
+PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")
+TEST = re.compile(r"(tests/\w+\.py)::(\w+)")
+SETTING = re.compile(r"`(\+?(?:explore|learn)\.[\w.]+=[\w.]+)`")
+
+
+def owners() -> Iterator[tuple[str, str]]:
+    """(file, class or function) of every docstring that says ``Deviates:``."""
+    for path in sorted((ROOT / "torchrl_etl").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and "Deviates:" in (
+                ast.get_docstring(node) or ""
+            ):
+                yield path.relative_to(ROOT).as_posix(), node.name
+
+
+def rows() -> list[list[str]]:
+    """Cells of the rows of the tables that have a column of tests."""
+    cells = [
+        [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        for line in PAGE.splitlines()
+        if line.startswith("|")
+    ]
+    return [
+        row for row in cells if len(row) == 7 and not set(row[0]) <= {"-"} and row[0] != "Place"
+    ]
+
+
+def flat(config: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key, value in config.items():
+        if isinstance(value, DictConfig):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            typed = json.dumps(value) if value is None or isinstance(value, bool) else value
+            yield f"{prefix}{key}={typed}"
+
+
+def explore_stage(*overrides: str) -> ExploreStage:
+    stage = Experiment(tiny("run_dir=unused", *overrides)).explore_stage()
+    stage.restart_collection()
+    for _ in range(4):
+        stage.collect()
+    stage.close()
+    return stage
+
+
+@pytest.mark.parametrize(("file", "owner"), list(owners()), ids=lambda value: value)
+def test_every_deviation_in_the_code_has_a_row(file, owner):
+    assert any(f"`{owner}`" in row[5] for row in rows()), f"{owner} of {file} is not on the page"
+
+
+def test_deviations_are_found_wherever_they_are_written():
+    found = sum(
+        path.read_text(encoding="utf-8").count("Deviates:")
+        for path in (ROOT / "torchrl_etl").rglob("*.py")
+    )
+    assert found == len(list(owners())), "Deviates: stands outside a docstring"
+
+
+def test_every_row_is_whole_and_names_tests_that_exist():
+    assert len(rows()) > 20
+    for row in rows():
+        named = TEST.findall(row[6])
+        assert all(row[index] for index in (0, 1, 3, 4, 5)) and named, row[0]
+        for file, test in named:
+            text = (ROOT / file).read_text(encoding="utf-8")
+            assert re.search(rf"^\s*(def|class) {test}\b", text, re.MULTILINE), f"{file}::{test}"
+
+
+def test_every_setting_of_the_paper_preset_is_on_the_page():
+    preset = OmegaConf.load(CONF / "faithful" / "paper.yaml")
+    selected = set(flat(preset))
+    listed = {
+        s.lstrip("+") for s in SETTING.findall(PAGE.split("## What `faithful=paper` selects")[1])
+    }
+    assert listed == selected
+    in_rows = {s.lstrip("+") for row in rows() for s in SETTING.findall(row[4])}
+    assert selected <= in_rows
+
+
+@pytest.mark.parametrize("setting", sorted({s for row in rows() for s in SETTING.findall(row[4])}))
+def test_every_setting_on_the_page_is_accepted_as_written(setting):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        compose("config", overrides=[setting])
+
+
+def test_the_paper_preset_reaches_the_parts_it_is_about():
+    paper = explore_stage("faithful=paper")
+    paper.update()
+    assert paper.bonus.deviation is None
+    assert paper.metric.regularizer == "literal"
+    direction = paper.buffer.storage[:]["direction"]
+    assert ((direction == 0) | (direction == 1)).all()
+    kept = paper.buffer.storage[:]
+    torch.testing.assert_close(kept["shown_action"], kept["action"])
+
+
+def test_embedding_size_follows_the_synergies_unless_given():
+    assert explore_stage("num_synergies=3").encoder.embedding_dim == 3
+    other = explore_stage("num_synergies=3", "explore.encoder.embedding_dim=5")
+    assert other.encoder.embedding_dim == 5
+    assert other.buffer.storage[:]["direction"].shape[-1] == 5
+
+
+def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
+    stage = explore_stage()
+    batch = stage.buffer.sample()
+
+    def metric_and_critic(key: str, factor: float) -> tuple[float, float]:
+        changed = batch.clone()
+        changed["next", key] = factor * changed["next", key]
+        torch.manual_seed(0)
+        metric = stage.metric(changed)["loss_metric"].item()
+        torch.manual_seed(0)
+        return metric, stage.sac(changed)["loss_qvalue"].item()
+
+    metric, critic = metric_and_critic("reward", 1.0)
+    with_reward, with_bonus = (
+        metric_and_critic("reward", 9.0),
+        metric_and_critic("intrinsic_reward", 9.0),
+    )
+    assert with_reward[0] != metric and with_reward[1] == critic
+    assert with_bonus[0] == metric and with_bonus[1] != critic
+
+
+@pytest.mark.parametrize(("updates", "trained"), [(0, False), (3, True)])
+def test_the_gmvae_is_trained_on_after_the_last_frame_unless_told_not_to(updates, trained):
+    stage = explore_stage(f"explore.fit.final_updates={updates}")
+    before = stage.gmvae.prior_loc.clone()
+    stage.finish()
+    assert (not torch.equal(stage.gmvae.prior_loc, before)) is trained
+
+
+def test_entropy_target_of_stage_1_is_sacs_usual_under_the_paper_preset():
+    usual = explore_stage("explore.sac.action_std=null").sac.target_entropy
+    assert usual.item() == pytest.approx(-16.0)
+    # 16 muscles, each ln(0.15 * sqrt(2 * pi * e)).
+    assert explore_stage().sac.target_entropy.item() == pytest.approx(16 * -0.47818, abs=1e-3)

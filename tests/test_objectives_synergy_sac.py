@@ -1,0 +1,189 @@
+"""SynergySACLoss: the check list, keys and wiring."""
+
+# ruff: noqa: RUF012  (class attributes that configure a check list are constants)
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, assert_close
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import ValueOperator
+
+from tests.loss_checks import SEED, LossChecks
+from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.objectives import SynergySACLoss
+
+OBSERVATION, SYNERGIES, ACTION, GAMMA = 3, 2, 5, 0.9
+NETWORK = {"hidden": (16, 16)}
+
+
+def make_loss(*, nested: bool = False, residual: float = 0.0, **kwargs: Any) -> SynergySACLoss:
+    def at(name: str) -> Any:
+        return ("agent", name) if nested else name
+
+    decoder = SynergyDecoder(
+        SYNERGIES,
+        ACTION,
+        hidden=(16,),
+        residual=residual,
+        in_keys=[at("synergy")],
+        out_keys=[at("action")],
+    )
+    spec = decoder.synergy_spec
+    loss = SynergySACLoss(
+        make_actor({at("observation"): OBSERVATION}, spec, out_key=at("synergy"), **NETWORK),
+        make_critic({at("observation"): OBSERVATION, at("action"): ACTION}, **NETWORK),
+        decoder,
+        action_spec=spec,
+        **kwargs,
+    )
+    if nested:
+        loss.set_keys(**{name: at(name) for name in ("reward", "done", "terminated")})
+    loss.make_value_estimator(gamma=GAMMA)
+    return loss
+
+
+def make_data(batch: tuple[int, ...] = (8,), *, nested: bool = False) -> TensorDict:
+    observation, following = torch.randn(2, *batch, OBSERVATION)
+    root = {"observation": observation, "action": 2 * torch.rand(*batch, ACTION) - 1}
+    terminated = torch.rand(*batch, 1) < 0.3
+    after = {
+        "observation": following,
+        "reward": torch.randn(*batch, 1),
+        "done": terminated | (torch.rand(*batch, 1) < 0.2),
+        "terminated": terminated,
+    }
+    if nested:
+        root, after = {"agent": root}, {"agent": after}
+    return TensorDict(root | {"next": after}, batch)
+
+
+class TestSynergySACLoss(LossChecks):
+    default_keys = {
+        "action": "synergy",
+        "reward": "reward",
+        "done": "done",
+        "terminated": "terminated",
+        "value": "state_value",
+        "state_action_value": "state_action_value",
+        "priority": "td_error",
+    }
+    trained = {
+        "loss_actor": {"actor_network_params", "decoder_network_params"},
+        "loss_qvalue": {"qvalue_network_params"},
+        "loss_alpha": {"log_alpha"},
+    }
+    targets = {"target_qvalue_network_params"}
+    recorded = {("next", "observation"), ("next", "reward")}
+    # The value estimator looks at done only where terminated is missing.
+    optional_keys = {("next", "done"), ("next", "terminated")}
+    options: dict[str, Any] = {}
+
+    def make_loss(self, *, nested: bool = False, **kwargs: Any) -> SynergySACLoss:
+        return make_loss(nested=nested, **self.options | kwargs)
+
+    def make_data(self, batch: tuple[int, ...] = (8,), *, nested: bool = False) -> TensorDict:
+        return make_data(batch, nested=nested)
+
+    def test_leaves_its_input_unchanged(self) -> None:
+        """But for the priorities, which every TorchRL loss on Q-values writes there."""
+        loss, data = self.built(), self.data()
+        before = data.clone()
+        sum(self.losses(loss(data)).values()).backward()
+        priority = data.pop("td_error")
+        assert priority.shape == data.shape and not priority.requires_grad
+        assert set(data.keys(True, True)) == set(before.keys(True, True))
+        assert_close(data, before)
+
+    def test_parameters_can_be_drawn_anew(self) -> None:
+        """The networks; SACLoss keeps its temperature."""
+        loss = self.built()
+        with torch.no_grad():
+            for parameter in loss.parameters():
+                parameter.add_(1000.0)
+        loss.reset_parameters_recursive()
+        stale = {
+            name
+            for name, parameter in loss.named_parameters()
+            if parameter.requires_grad and parameter.abs().max() > 500
+        }
+        assert stale == {"log_alpha"}
+
+
+class TestFrozenDecoder(TestSynergySACLoss):
+    options = {"train_decoder": False}
+    trained = TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
+
+
+class TestWithResidual(TestSynergySACLoss):
+    options = {"residual": 0.3}
+
+
+class TestWithoutVmap(TestSynergySACLoss):
+    options = {"deactivate_vmap": True}
+
+
+# Keys and wiring
+
+
+def test_in_keys_are_what_is_read_in_a_fixed_order() -> None:
+    following = [("next", key) for key in ("observation", "reward", "done", "terminated")]
+    assert make_loss().in_keys == ["observation", "action", *following]
+
+
+def test_the_fresh_synergy_may_go_elsewhere() -> None:
+    loss, data = make_loss(), make_data()
+    outs = []
+    for key in ("synergy", ("fresh", "coefficients")):
+        loss.set_keys(action=key)
+        torch.manual_seed(SEED)
+        outs.append(loss(data))
+    assert_close(*outs)
+
+
+def test_a_sample_that_the_critic_reads_is_refused() -> None:
+    with pytest.raises(ValueError, match="could not be told from a fresh one"):
+        make_loss().set_keys(action="action")
+    decoder = SynergyDecoder(SYNERGIES, ACTION)
+    with pytest.raises(ValueError, match=r"sample goes to 'synergy', which the critic reads"):
+        SynergySACLoss(
+            make_actor({"observation": 3}, decoder.synergy_spec, out_key="synergy"),
+            make_critic({"synergy": SYNERGIES, "action": ACTION}),
+            decoder,
+        )
+
+
+@pytest.mark.parametrize(
+    ("keys", "sample", "reads"),
+    [
+        ({"in_keys": ["z"]}, "synergy", "action"),
+        ({}, "action", "action"),
+        ({}, "synergy", "muscles"),
+        ({"in_keys": ["loc"]}, "synergy", "action"),  # the actor writes it, but it is no sample
+    ],
+)
+def test_wrong_wiring_is_refused(keys: dict[str, Any], sample: str, reads: str) -> None:
+    decoder = SynergyDecoder(SYNERGIES, ACTION, **keys)
+    with pytest.raises(ValueError, match=r"The decoder maps .* input must be the actor's sample"):
+        SynergySACLoss(
+            make_actor({"observation": 3}, decoder.synergy_spec, out_key=sample),
+            make_critic({"observation": 3, reads: ACTION}),
+            decoder,
+        )
+
+
+def test_several_decoder_keys_plain_networks_and_value_networks_are_refused() -> None:
+    loss = make_loss()
+    actor, critic = loss.actor_network, loss.qvalue_network
+    two = TensorDictModule(lambda x, y: x, in_keys=["synergy", "observation"], out_keys=["action"])
+    with pytest.raises(ValueError, match="The decoder maps"):
+        SynergySACLoss(actor, critic, two)
+    with pytest.raises(TypeError, match="decoder is a Linear"):
+        SynergySACLoss(actor, critic, nn.Linear(2, 5))
+    value = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+    with pytest.raises(TypeError, match="value_network is given"):
+        SynergySACLoss(actor, critic, loss.decoder_network, value_network=value)

@@ -1,0 +1,167 @@
+"""The recipes as a person runs them: in a process, on real muscles, with typos."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.configs import ROOT, TINY
+
+SMALL = [override for override in TINY if not override.startswith("env=")]
+
+
+def run(recipe: str, *overrides: str, cwd: Path, seconds: int = 240) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=seconds,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory) -> Path:
+    """A smoke run of both stages on a MyoSuite hand, with pictures, in a path with a space."""
+    folder = tmp_path_factory.mktemp("with a space") / "a run"
+    done = run(
+        "etl_sac.py",
+        *SMALL,
+        "env=myoHandPose",
+        "pictures=true",
+        f"run_dir='{folder}'",
+        cwd=folder.parent,
+    )
+    assert done.returncode == 0, done.stderr
+    for word in ("variance accounted for", "before", "solved", str(folder / "pictures")):
+        assert word in done.stdout
+    return folder
+
+
+@pytest.mark.slow
+def test_a_run_leaves_everything_behind(hand):
+    for name in (
+        "config.yaml",
+        "versions.json",
+        "summary.json",
+        "synergies/synergies.safetensors",
+        "synergies/synergies.json",
+        "csv/scalars/learn/eval/return.csv",
+        "pictures/learning_curves.png",
+        "pictures/synergies.png",
+        "pictures/vaf.png",
+        "pictures/embedding.png",
+    ):
+        assert (hand / name).is_file(), name
+    assert list((hand / "tensorboard").glob("events*"))
+    summary = json.loads((hand / "summary.json").read_text())
+    assert summary["learn"]["frames_charged"] == 1216
+    assert {"return", "solved", "solved_time"} <= summary["learn"].keys()
+    assert "??" not in (hand / "config.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand):
+    done = run("evaluate.py", f"run='{hand}'", "episodes=2", cwd=hand.parent)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((hand / "evaluation.json").read_text())
+    summary = json.loads((hand / "summary.json").read_text())
+    assert result["return"]["mean"] == pytest.approx(summary["learn"]["return"]["after"])
+    assert "95% interval" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
+    done = run(
+        "etl_sac.py",
+        *SMALL,
+        "env=myoHandKeyTurn",
+        "stage=learn",
+        f"synergies='{hand}'",
+        f"run_dir='{tmp_path}/run'",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["synergies"]["task"] == "myoHandPoseFixed-v0"
+    assert summary["learn"]["frames_charged"] == summary["learn"]["frames"]
+    assert not (tmp_path / "run" / "synergies").exists()
+
+
+@pytest.mark.slow
+def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
+    done = run(
+        "etl_sac.py",
+        *SMALL,
+        "env=humanoid-stand",
+        f"synergies='{hand}'",
+        f"run_dir='{tmp_path}/run'",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("Error: ") and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("recipe", "override", "words"),
+    [
+        ("etl_sac.py", "enf=myoHandPose", "did you mean env"),
+        ("etl_sac.py", "learn.frame=3", "learn.frames"),
+        ("etl_sac.py", "env=myoHandPos", "myoHandPose"),
+        ("etl_sac.py", "myoHandPose", "not of the form key=value"),
+        ("evaluate.py", "run=nowhere", "holds no run"),
+        ("evaluate.py", "episode=3", "did you mean episodes"),
+    ],
+)
+def test_a_typo_gets_the_nearest_right_word_and_no_traceback(recipe, override, words, tmp_path):
+    done = run(recipe, override, cwd=tmp_path)
+    assert done.returncode != 0
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_explains_the_settings(tmp_path):
+    done = run("etl_sac.py", "--help", cwd=tmp_path)
+    assert done.returncode == 0
+    for word in ("stage", "synergies", "faithful", "experiment", "resume"):
+        assert word in done.stdout
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
+    folder = tmp_path / "run"
+    arguments = [*TINY, "explore.frames=100000", f"run_dir='{folder}'"]
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "recipes" / "etl_sac.py"), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    deadline = time.monotonic() + 120
+    while not list(folder.glob("checkpoints/explore/*/seal.json")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"resume='{folder}'" in output
+    assert "Traceback" not in output
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_both_stages_run_on_cuda(tmp_path):
+    done = run("etl_sac.py", *TINY, "device=cuda", f"run_dir='{tmp_path}/run'", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,101 @@
+"""Every configuration composes; every fault is one sentence that says how to mend it."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+
+from tests.configs import CONF, tiny
+from torchrl_etl.envs import list_tasks
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.training import Experiment, resumed_config, validate
+
+GROUPS = {
+    name: sorted(p.stem for p in (CONF / name).glob("*.yaml"))
+    for name in ("experiment", "faithful")
+}
+
+
+@pytest.mark.parametrize(("experiment", "faithful"), itertools.product(*GROUPS.values()))
+def test_every_pair_of_groups_is_valid(experiment, faithful):
+    validate(tiny(f"experiment={experiment}", f"faithful={faithful}"))
+
+
+@pytest.mark.parametrize("task", [task.name for task in list_tasks()])
+def test_every_task_of_the_paper_is_valid(task):
+    validate(tiny(f"env={task}"))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("env=myoHandPenTwist", "myoHandPenTwirl"),
+        ("env=CartPole-v1", "continuous"),
+        ("env=myoLegWalk goal=random", "myoHandPose"),
+        ("stage=lern", "stage is 'lern'; choose one of explore, learn, all (nearest: learn)"),
+        ("goal=fix", "fixed"),
+        ("num_synergies=0", "num_synergies is 0; it must be a number above 0"),
+        ("num_synergies=17", "overactuated has 16 actuators; choose at most that many"),
+        ("explore.frames=-5", "explore.frames is -5; it must be a number above 0"),
+        ("learn.frames=many", "learn.frames is 'many'; it must be a number above 0"),
+        ("learn.updates_per_frame=0", "learn.updates_per_frame is 0"),
+        ("seed=-1", "seed is -1; it must be a number 0 or more"),
+        ("collector.frames_per_batch=33", "must be a multiple of the second"),
+        ("checkpoint.keep=1", "keep at least 2"),
+        ("explore.fit.best_share=0", "must lie in (0, 1]"),
+        ("explore.fit.actions=loc", "mean, sampled, activation"),
+        ("learn.fine_tuning=freeze", "nearest: frozen"),
+        ("learn.residual=2", "residual is 2"),
+        ("stage=learn", "stage=learn needs synergies=PATH"),
+        ("stage=explore synergies=x", "leave it out or use stage=learn"),
+        ("synergies=nowhere", "nowhere"),
+        ("device=gpu", "device is 'gpu'; use cpu, cuda or cuda:0"),
+        ("log=[csv,tensorbord]", "nearest: tensorboard"),
+        ("explore.metric.regularizer=hing", "hinge"),
+    ],
+)
+def test_a_fault_is_named_with_its_remedy_before_anything_runs(override, words, tmp_path):
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        Experiment(tiny(f"run_dir='{tmp_path}/run'", *override.split()))
+    assert words in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_without_a_device_says_so():
+    with pytest.raises(ValueError, match="no CUDA device is available; use device=cpu"):
+        Experiment(tiny("device=cuda"))
+
+
+def test_a_bundle_for_other_muscles_is_refused(tmp_path):
+    decoder = SynergyDecoder(2, 3)
+    save_bundle(decoder, tmp_path / "other", task="arm", actuators=["a", "b", "c"])
+    with pytest.raises(ValueError, match="3"):
+        Experiment(tiny(f"synergies='{tmp_path}/other'"))
+
+
+def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
+    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'"))
+    experiment.folder.open(resume=False)
+    with pytest.raises(FileExistsError, match="already holds a run; go on with it by resume="):
+        Experiment(tiny(f"run_dir='{tmp_path}/run'")).run()
+
+
+def test_an_unwritable_folder_is_named(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(OSError, match="cannot be written"):
+        Experiment(tiny(f"run_dir='{tmp_path}/file/run'")).run()
+
+
+def test_resuming_what_is_no_run_is_named(tmp_path):
+    with pytest.raises(ValueError, match="holds no run"):
+        resumed_config(tmp_path)
+
+
+def test_a_group_cannot_be_swapped_on_resume(tmp_path):
+    Experiment(tiny(f"run_dir='{tmp_path}/run'")).folder.open(resume=False)
+    with pytest.raises(ValueError, match="cannot be changed when a run is resumed"):
+        resumed_config(tmp_path / "run", ["experiment=quick"])

@@ -1,0 +1,49 @@
+"""Equations 1-10 of Explore to Learn as pure tensor functions.
+
+No keys, no modules, no state: tensors in, tensors out. Every function works on any number of
+leading batch dimensions (written ``*``), and none of them reduces over the batch: that is left to
+the caller. Symbols: ``n`` actuators, ``d`` synergies, ``k`` embedding dimensions, ``C`` mixture
+components.
+"""
+
+from torchrl_etl.functional.metric import (
+    direction_bonus,
+    discriminability,
+    effective_rank,
+    encoder_loss,
+    expected_distance,
+    gaussian_w2,
+    l2_distance,
+    metric_loss,
+    metric_target,
+    mico_distance,
+)
+from torchrl_etl.functional.synergy import (
+    GMVAEBound,
+    categorical_kl,
+    gaussian_kl,
+    gaussian_log_prob,
+    gmvae_bound,
+    mixture_log_prob,
+    reconstruction_loss,
+)
+
+__all__ = [
+    "GMVAEBound",
+    "categorical_kl",
+    "direction_bonus",
+    "discriminability",
+    "effective_rank",
+    "encoder_loss",
+    "expected_distance",
+    "gaussian_kl",
+    "gaussian_log_prob",
+    "gaussian_w2",
+    "gmvae_bound",
+    "l2_distance",
+    "metric_loss",
+    "metric_target",
+    "mico_distance",
+    "mixture_log_prob",
+    "reconstruction_loss",
+]

@@ -1,0 +1,55 @@
+"""How a checkpoint holds a replay buffer: its filled rows and where the next one goes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDict
+from torchrl.checkpoint import CheckpointAdapter
+from torchrl.data import ReplayBuffer
+
+__all__ = ["BufferAdapter"]
+
+
+class BufferAdapter(CheckpointAdapter):
+    """Saves the filled part of a buffer as memory maps.
+
+    TorchRL's own way (0.14.1) writes the storage at full capacity, refuses to load it into one of
+    another capacity (so no budget could be changed on resume), and pickles the prefetch queue.
+    """
+
+    adapter_id = "torchrl_etl.buffer"
+
+    def save(
+        self,
+        component: ReplayBuffer,
+        path: Path,
+        *,
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        path.mkdir(parents=True)
+        rows = component.storage[:] if len(component) else TensorDict({}, [0])
+        rows.cpu().memmap(str(path / "rows"), copy_existing=True)
+        position = {"cursor": component.writer._cursor, "rows": len(component)}
+        (path / "position.json").write_text(json.dumps(position))
+
+    def load(
+        self,
+        component: ReplayBuffer,
+        path: Path,
+        *,
+        map_location: Any,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        position = json.loads((path / "position.json").read_text())
+        component.empty()
+        if position["rows"]:
+            component.extend(TensorDict.load_memmap(path / "rows"))
+            if position["rows"] == component.storage.max_size:  # full: the oldest row goes next
+                component.writer._cursor = position["cursor"]
