@@ -1,5 +1,6 @@
 # make demo: both stages of ETL on a MyoSuite hand, in a few minutes.
 # make test: the whole test suite, in the same environment.
+# make smoke: both stages on each of the paper's 13 tasks, for as long as it takes to see them run.
 
 PYTHON ?= python3
 # Everything is run from inside the repository, so a path with a space in it is fine.
@@ -9,13 +10,18 @@ BIN := $(VENV)/bin
 export MPLBACKEND := Agg
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint lock clean
+.PHONY: demo test smoke lint lock clean
 
 demo: $(VENV)/.complete
 	$(BIN)/python recipes/etl_sac.py env=myoHandPenTwirl experiment=demo
 
 test: $(VENV)/.complete lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+smoke: $(VENV)/.complete
+	set -e; for task in $$($(BIN)/python recipes/list_tasks.py names); do \
+	  $(BIN)/python recipes/etl_sac.py env=$$task experiment=smoke progress=false; \
+	done
 
 lint: $(VENV)/.complete
 	$(BIN)/ruff check .

@@ -11,8 +11,15 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl
-from torchrl_etl.training import Experiment, record_episodes, resumed_config
+from torchrl_etl.command_line import (
+    check_overrides,
+    draw_without_display,
+    one_sentence,
+    quiet_torchrl,
+)
+
+draw_without_display()
+from torchrl_etl.training import Experiment, record_episodes, resumed_config  # noqa: E402
 
 CONF = Path(__file__).parent / "conf"
 
@@ -40,7 +47,7 @@ def main(config: DictConfig) -> None:
             print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
     print(f"  written to {path}")
     if config.video:
-        with one_sentence(RuntimeError):
+        with one_sentence(RuntimeError, ValueError):
             videos = record_episodes(
                 experiment.evaluation_env(stage),
                 stage.policy,

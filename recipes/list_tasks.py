@@ -1,9 +1,12 @@
 """Print the paper's tasks: names, ids, goals, actuators and episode lengths.
 
-python recipes/list_tasks.py
+python recipes/list_tasks.py         # the table
+python recipes/list_tasks.py names   # one name a line, for scripts
 """
 
 from __future__ import annotations
+
+import sys
 
 from torchrl_etl.envs import actuator_names, list_tasks
 
@@ -11,6 +14,11 @@ HEADER = ("name", "id (fixed goal)", "id (random goal)", "actuators", "steps")
 
 
 def main() -> None:
+    if sys.argv[1:] == ["names"]:
+        print("\n".join(task.name for task in list_tasks()))
+        return
+    if sys.argv[1:]:
+        sys.exit(f"Error: list_tasks.py takes 'names' or nothing, not {' '.join(sys.argv[1:])!r}.")
     rows = [
         (
             task.name,

@@ -80,6 +80,22 @@ def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand):
 
 
 @pytest.mark.slow
+def test_evaluate_draws_a_video_or_says_what_to_install(hand):
+    done = run(
+        "evaluate.py",
+        f"run='{hand}'",
+        "episodes=1",
+        "video=true",
+        "video_episodes=1",
+        cwd=hand.parent,
+    )
+    if done.returncode:
+        assert "install a GL back end" in done.stderr and "Traceback" not in done.stderr
+    else:
+        assert (hand / "videos" / "episode0.mp4").stat().st_size > 10_000
+
+
+@pytest.mark.slow
 def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
     done = run(
         "etl_sac.py",

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import difflib
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from ctypes.util import find_library
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-__all__ = ["check_overrides", "one_sentence", "quiet_torchrl"]
+__all__ = ["check_overrides", "draw_without_display", "one_sentence", "quiet_torchrl"]
 
 
 def check_overrides(config: Path, arguments: list[str]) -> None:
@@ -45,6 +47,15 @@ def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def draw_without_display() -> None:
+    """Let MuJoCo draw through EGL where there is no display.
+
+    MuJoCo chooses its back end when it is first imported, so call this before.
+    """
+    if "DISPLAY" not in os.environ and find_library("EGL"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 def quiet_torchrl() -> None:

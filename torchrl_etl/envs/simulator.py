@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 from torchrl.envs import EnvBase, GymWrapper
 
 __all__ = ["mujoco_state", "simulator"]
@@ -39,7 +40,7 @@ def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
     inner = simulator(env)
     if hasattr(inner, "physics"):  # DMControl
         return inner.physics.model.ptr, inner.physics.data.ptr
-    for model, data in (("mj_model", "mj_data"), ("model", "data")):
-        if hasattr(inner, model) and hasattr(inner, data):
-            return getattr(inner, model), getattr(inner, data)
+    model, data = getattr(inner, "model", None), getattr(inner, "data", None)
+    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        return model, data
     raise ValueError(f"{type(inner).__name__} does not run on MuJoCo, so it cannot be drawn.")

@@ -40,6 +40,7 @@ def record_episodes(
 
     Raises:
         RuntimeError: if the machine has no way to draw, naming what to install.
+        ValueError: if the environment does not run on MuJoCo.
     """
     model, data = mujoco_state(env)
     # The default frame buffer of most models is smaller than a readable picture.
