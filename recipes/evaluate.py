@@ -54,6 +54,7 @@ def main(config: DictConfig) -> None:
                 experiment.folder.path / "videos",
                 episodes=config.video_episodes,
                 size=tuple(config.video_size),
+                camera=config.video_camera,
             )
         print("  videos  " + ", ".join(str(video) for video in videos))
 

@@ -24,6 +24,7 @@ def record_episodes(
     *,
     episodes: int,
     size: tuple[int, int] = (480, 640),
+    camera: str | None = None,
     max_steps: int = 1000,
 ) -> list[Path]:
     """Render the deterministic policy on the first evaluation seeds.
@@ -36,13 +37,19 @@ def record_episodes(
     Keyword Args:
         episodes (int): number of episodes.
         size (tuple of int): height and width in pixels.
+        camera (str, optional): a camera of the model; by default its first, or else one that sees
+            the whole scene.
         max_steps (int): where to cut an episode that does not end.
 
     Raises:
         RuntimeError: if the machine has no way to draw, naming what to install.
-        ValueError: if the environment does not run on MuJoCo.
+        ValueError: if the environment does not run on MuJoCo or has no such camera.
     """
     model, data = mujoco_state(env)
+    cameras = [model.camera(i).name for i in range(model.ncam)]
+    if camera is not None and camera not in cameras:
+        raise ValueError(f"There is no camera {camera!r}; the model has {', '.join(cameras)}.")
+    view = camera or (0 if cameras else -1)
     # The default frame buffer of most models is smaller than a readable picture.
     model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
@@ -65,7 +72,7 @@ def record_episodes(
             frames: list[np.ndarray] = []
 
             def draw(*_: object, frames: list[np.ndarray] = frames) -> None:
-                renderer.update_scene(data)
+                renderer.update_scene(data, view)
                 frames.append(renderer.render())
 
             env.set_seed(EVALUATION_SEED + episode)
