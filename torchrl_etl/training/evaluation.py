@@ -13,7 +13,7 @@ from torchrl_etl.analysis import Interval, interval, success_interval
 __all__ = ["EVALUATION_SEED", "Evaluation", "evaluate"]
 
 EVALUATION_SEED = 10_000_000
-"""Seed of the first evaluation episode; training seeds are mixed so as to stay clear of it."""
+"""Seed of the first evaluation episode; training seeds start at 2**30."""
 
 SOLVED_STEPS = 5
 """An episode counts as solved if it was so on more than this many steps, as MyoSuite counts."""

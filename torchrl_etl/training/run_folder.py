@@ -94,7 +94,9 @@ class RunFolder:
     def log(self, values: Mapping[str, float], frame: int) -> None:
         """Log scalars at a frame count that charges both stages."""
         if self._loggers is None:
-            self._loggers = [self._logger(name) for name in self._config.log]
+            # The summary and the learning curves are read back from the CSV files.
+            names = dict.fromkeys(("csv", *self._config.log))
+            self._loggers = [self._logger(name) for name in names]
         for logger in self._loggers:
             for key, value in values.items():
                 logger.log_scalar(key, float(value), step=frame)

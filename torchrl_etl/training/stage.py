@@ -157,8 +157,11 @@ class Stage(ABC):
 
 
 def _mix(seed: int, frames: int) -> int:
-    """A seed for the environments of the segment that starts at ``frames``."""
-    return (seed * 1_000_003 + frames) % 2**31
+    """A seed for the environments of the segment that starts at ``frames``.
+
+    It has its highest bit set, which no evaluation seed has.
+    """
+    return 2**30 + (seed * 1_000_003 + frames) % 2**30
 
 
 def entropy_target(action_spec: Bounded, action_std: float | None) -> float | str:
