@@ -1,6 +1,12 @@
 """Explore to Learn with SAC: find synergies, then learn the task in them.
 
-python recipes/etl_sac.py env=myoHandPenTwirl experiment=quick
+    python recipes/etl_sac.py env=myoHandPenTwirl experiment=quick
+    python recipes/etl_sac.py env=myoHandKeyTurn stage=learn synergies=runs/NAME
+    python recipes/etl_sac.py resume=runs/NAME
+
+Settings are given as key=value, nested ones with a dot: learn.sac.lr=1e-3. A run leaves its
+configuration, metrics, checkpoints, synergies and pictures in run_dir. These are all settings,
+with their defaults:
 """
 
 from __future__ import annotations
@@ -64,5 +70,5 @@ def report(summary: dict[str, Any], folder: Path) -> str:
 
 
 if __name__ == "__main__":
-    check_overrides(CONF / "config.yaml", sys.argv[1:])
+    check_overrides(CONF / "config.yaml", sys.argv[1:], __doc__)
     main()

@@ -1,6 +1,8 @@
 """Evaluate a run of etl_sac.py on fixed seeds: return and solved, with intervals.
 
-python recipes/evaluate.py run=runs/... episodes=50 video=true
+    python recipes/evaluate.py run=runs/NAME episodes=50 video=true
+
+These are all settings, with their defaults:
 """
 
 from __future__ import annotations
@@ -60,5 +62,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    check_overrides(CONF / "evaluate.yaml", sys.argv[1:])
+    check_overrides(CONF / "evaluate.yaml", sys.argv[1:], __doc__)
     main()

@@ -16,17 +16,24 @@ from omegaconf import DictConfig, OmegaConf
 __all__ = ["check_overrides", "draw_without_display", "one_sentence", "quiet_torchrl"]
 
 
-def check_overrides(config: Path, arguments: list[str]) -> None:
-    """Leave with the nearest key if an override names one that does not exist.
+def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
+    """Answer ``--help``, and leave with the nearest key if an override names none that exists.
 
-    Hydra would refuse it too, but without a suggestion.
+    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing.
 
     Args:
         config (path): the primary YAML file; folders beside it are groups.
         arguments (list of str): the command line without the program.
+        usage (str): what the help begins with.
     """
-    known = list(_keys(OmegaConf.load(config)))
-    known += [group.name for group in config.parent.iterdir() if group.is_dir()]
+    text = config.read_text(encoding="utf-8")
+    if {"-h", "--help"} & set(arguments):
+        settings, _, _ = text.partition("\nhydra:")
+        print(usage.strip(), settings, sep="\n\n")
+        sys.exit()
+    groups = OmegaConf.create(text).get("defaults", [])
+    known = list(_keys(OmegaConf.create(text)))
+    known += [name for entry in groups if isinstance(entry, DictConfig) for name in entry]
     for argument in arguments:
         key, separator, _ = argument.partition("=")
         if argument.startswith(("-", "+", "~")) or key.startswith("hydra"):
