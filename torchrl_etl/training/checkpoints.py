@@ -12,7 +12,9 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-__all__ = ["Checkpoints", "write_atomically"]
+from torchrl_etl.modules.atomic_files import write_atomically
+
+__all__ = ["Checkpoints"]
 
 _SEAL = "seal.json"
 # What TorchRL writes for tensors and plain values. Anything else (a pickle above all) could run
@@ -78,17 +80,6 @@ class Checkpoints(CheckpointRotation):
                 shutil.rmtree(leftover, ignore_errors=True)
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that a crash leaves the old content or the new one, never a mixture."""
-    scratch = path.with_name(f".{path.name}.tmp")
-    with scratch.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(scratch, path)
-    _flush_folder(path.parent)
-
-
 def _digests(folder: Path, *, flush: bool = False) -> dict[str, str]:
     digests = {}
     for path in sorted(folder.rglob("*")):
@@ -115,11 +106,3 @@ def _fault(folder: Path) -> str | None:
         names = sorted(found.items() ^ sealed.items())
         return f"{names[0][0]} is not as it was written"
     return None
-
-
-def _flush_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl_etl.analysis import learning_curves
 from torchrl_etl.envs import actuator_names, episode_length, make_env, resolve_task
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.atomic_folder import surviving_folder
+from torchrl_etl.modules.atomic_files import surviving_folder
 from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import validate

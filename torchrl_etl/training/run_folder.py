@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
-from torchrl_etl.training.checkpoints import write_atomically
+from torchrl_etl.modules.atomic_files import write_atomically
 
 __all__ = ["RunFolder", "facts"]
 

@@ -1,4 +1,4 @@
-"""Replace a folder of files so that a crash leaves the old one or the new one, never a mixture."""
+"""Replace files so that a crash leaves the old ones or the new ones, never a mixture."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["replace_folder", "surviving_folder"]
+__all__ = ["flush_folder", "replace_folder", "surviving_folder", "write_atomically"]
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -45,7 +45,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        _flush(fresh)
+        flush_folder(fresh)
         if folder.exists():
             shutil.rmtree(aside, ignore_errors=True)
             os.replace(folder, aside)
@@ -55,7 +55,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             if aside.exists():
                 os.replace(aside, folder)
             raise
-        _flush(parent)
+        flush_folder(parent)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
     shutil.rmtree(aside, ignore_errors=True)
@@ -75,7 +75,18 @@ def _aside(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.previous")
 
 
-def _flush(folder: Path) -> None:
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, and flush it to disk."""
+    scratch = path.with_name(f".{path.name}.tmp")
+    with scratch.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(scratch, path)
+    flush_folder(path.parent)
+
+
+def flush_folder(folder: Path) -> None:
     """Put the folder's own entries, not only its files' contents, on disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
