@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+import gc
 
 import pytest
 import torch
 from torch import nn
 
 from tests.configs import tiny
+from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Experiment
 
@@ -182,3 +184,19 @@ def test_gaussian_divergence_trains_its_latent_dynamics():
     fill(stage)
     assert "loss_dynamics" in stage.update().keys()
     stage.close()
+
+
+def test_restarting_collection_lets_the_old_simulators_go():
+    stage = explore_stage()
+
+    def simulators():
+        return sum(type(thing) is AnalyticOveractuated for thing in gc.get_objects())
+
+    gc.collect()
+    before = simulators()
+    for _ in range(3):
+        stage.restart_collection()
+        stage.collect()
+    assert simulators() == before
+    stage.close()
+    assert simulators() == before - 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -153,7 +154,10 @@ class Stage(ABC):
     def close(self) -> None:
         if self.collector is not None:
             self.collector.shutdown()
-            self.collector = None
+            # Simulators hold 100 MB each and sit in reference cycles: do not wait for the
+            # garbage collector to come by.
+            self.collector = self._batches = None
+            gc.collect()
 
 
 def _mix(seed: int, frames: int) -> int:
