@@ -127,6 +127,17 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
     assert done.stderr.startswith("Error: ") and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", ["env=Pendulum-v1 num_synergies=1", "faithful=paper", "learn.residual=0.2"]
+)
+def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path):
+    done = run("etl_sac.py", *TINY, *options.split(), f"run_dir='{tmp_path}/run'", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = run("evaluate.py", f"run='{tmp_path}/run'", "episodes=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize(
     ("recipe", "override", "words"),
     [

@@ -115,10 +115,8 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
         env (str or EnvBase or gymnasium.Env): a task's name, or an environment on one.
 
     Returns:
-        list of str: one name for each entry of the action.
-
-    Raises:
-        ValueError: if the environment has no MuJoCo model to read.
+        list of str: one name for each entry of the action; ``actuator_0`` and so on where there is
+        no MuJoCo model to read them from.
 
     Examples:
         >>> from torchrl_etl.envs import actuator_names
@@ -160,7 +158,7 @@ def _raw_actuator_names(simulation: Any) -> list[str]:
         return [model.id2name(i, "actuator") for i in range(model.nu)]
     model = getattr(simulation, "model", None)
     if not hasattr(model, "actuator"):
-        raise ValueError(f"{simulation} has no MuJoCo model, so its actuators have no names.")
+        return [f"actuator_{i}" for i in range(simulation.action_space.shape[0])]
     return [model.actuator(i).name for i in range(model.nu)]
 
 
