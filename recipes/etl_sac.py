@@ -11,15 +11,17 @@ with their defaults:
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl
+from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
 
@@ -29,7 +31,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError):
+    with one_sentence(ValueError, OSError, ImportError, gymnasium.error.Error):
         resume = None
         if config.resume is not None:
             resume = Path(config.resume)
@@ -41,7 +43,8 @@ def main(config: DictConfig) -> None:
         with one_sentence(OSError, SimulationError):
             summary = experiment.run()
     except Interrupted:
-        print(f"Stopped and saved. To go on: python {sys.argv[0]} resume='{folder}'")
+        command = shlex.join(["python", sys.argv[0], f"resume={folder}"])
+        print(f"Stopped and saved. To go on: {command}")
         sys.exit(130)
     print(report(summary, folder))
 
@@ -70,5 +73,6 @@ def report(summary: dict[str, Any], folder: Path) -> str:
 
 
 if __name__ == "__main__":
+    sys.argv[1:] = quote_paths(sys.argv[1:], "run_dir", "resume", "synergies")
     check_overrides(CONF / "config.yaml", sys.argv[1:], __doc__)
     main()

@@ -11,13 +11,14 @@ import sys
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+from omegaconf import DictConfig, MissingMandatoryValue
 
 from torchrl_etl.command_line import (
     check_overrides,
     draw_without_display,
     one_sentence,
     quiet_torchrl,
+    quote_paths,
 )
 
 draw_without_display()
@@ -29,7 +30,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError):
+    with one_sentence(ValueError, OSError, MissingMandatoryValue):
         run = Path(config.run)
         trained = resumed_config(
             run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]
@@ -62,5 +63,6 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    sys.argv[1:] = quote_paths(sys.argv[1:], "run")
     check_overrides(CONF / "evaluate.yaml", sys.argv[1:], __doc__)
     main()

@@ -37,18 +37,39 @@ def test_every_task_of_the_paper_is_valid(task):
         ("env=myoLegWalk goal=random", "myoHandPose"),
         ("stage=lern", "stage is 'lern'; choose one of explore, learn, all (nearest: learn)"),
         ("goal=fix", "fixed"),
-        ("num_synergies=0", "num_synergies is 0; it must be a number above 0"),
+        ("num_synergies=0", "num_synergies is 0; it must be a whole number above 0"),
         ("num_synergies=17", "overactuated has 16 actuators; choose at most that many"),
-        ("explore.frames=-5", "explore.frames is -5; it must be a number above 0"),
-        ("learn.frames=many", "learn.frames is 'many'; it must be a number above 0"),
+        ("explore.frames=-5", "explore.frames is -5; it must be a whole number above 0"),
+        ("learn.frames=many", "learn.frames is 'many'; it must be a whole number above 0"),
         ("learn.updates_per_frame=0", "learn.updates_per_frame is 0"),
-        ("seed=-1", "seed is -1; it must be a number 0 or more"),
+        ("seed=-1", "seed is -1; it must be a whole number from 0"),
+        ("seed=0.5", "seed is 0.5"),
         ("collector.frames_per_batch=33", "must be a multiple of the second"),
-        ("checkpoint.keep=1", "keep at least 2"),
-        ("explore.fit.best_share=0", "must lie in (0, 1]"),
+        ("checkpoint.keep=1", "checkpoint.keep is 1; it must be a whole number above 1"),
+        ("explore.fit.best_share=0", "explore.fit.best_share is 0; it must be a share in (0, 1]"),
         ("explore.fit.actions=loc", "mean, sampled, activation"),
         ("learn.fine_tuning=freeze", "nearest: frozen"),
-        ("learn.residual=2", "residual is 2"),
+        ("learn.residual=2", "learn.residual is 2; it must be a share in [0, 1]"),
+        ("explore.fit.final_updates=0.5", "explore.fit.final_updates is 0.5"),
+        ("evaluation.episodes=1.5", "evaluation.episodes is 1.5"),
+        ("learn.decoder_lr=null", "learn.decoder_lr is None; it must be a number above 0"),
+        ("learn.decoder_lr=-1", "learn.decoder_lr is -1"),
+        ("learn.anchor=nan", "learn.anchor is nan"),
+        ("learn.batch_size=1", "learn.batch_size is 1; it must be a whole number above 1"),
+        ("explore.reward_scale=abc", "explore.reward_scale is 'abc'"),
+        ("explore.sac.action_std=0", "a number above 0 or null"),
+        ("explore.direction.kind=foo", "sphere"),
+        ("explore.direction.num_directions=3 explore.direction.kind=orthonormal", "3"),
+        ("explore.fit.actions=activation", "activation"),
+        ("network.hidden=[0]", "network.hidden is [0]; it must be a list of whole numbers"),
+        ("vaf_curve.dims=3", "vaf_curve.dims is 3"),
+        ("threads=-1", "threads is -1"),
+        ("pictures=abc", "pictures is 'abc'; it must be true or false"),
+        ("device=null", "device is None; it must be a text"),
+        ("device=meta", "device is 'meta'; use cpu"),
+        ("env=3", "env is 3; it must be a text"),
+        ("log=tensorboard", "log is 'tensorboard'; it must be a list"),
+        ("log=[wandb]", "pip install wandb"),
         ("stage=learn", "stage=learn needs synergies=PATH"),
         ("stage=explore synergies=x", "leave it out or use stage=learn"),
         ("synergies=nowhere", "nowhere"),
@@ -95,7 +116,22 @@ def test_resuming_what_is_no_run_is_named(tmp_path):
         resumed_config(tmp_path)
 
 
-def test_a_group_cannot_be_swapped_on_resume(tmp_path):
+@pytest.mark.parametrize(
+    "override", ["experiment=quick", "network.hidden=[16]", "num_synergies=3", "env=myoHandPose"]
+)
+def test_what_would_make_it_another_run_cannot_be_changed_on_resume(override, tmp_path):
     Experiment(tiny(f"run_dir='{tmp_path}/run'")).folder.open(resume=False)
+    before = (tmp_path / "run" / "config.yaml").read_text()
     with pytest.raises(ValueError, match="cannot be changed when a run is resumed"):
-        resumed_config(tmp_path / "run", ["experiment=quick"])
+        resumed_config(tmp_path / "run", [override])
+    assert (tmp_path / "run" / "config.yaml").read_text() == before
+
+
+def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
+    decoder = SynergyDecoder(3, 16)
+    names = [f"muscle_{i}" for i in range(16)]
+    save_bundle(decoder, tmp_path / "bundle", task="overactuated", actuators=names)
+    monkeypatch.chdir(tmp_path)
+    experiment = Experiment(tiny("synergies=bundle", "num_synergies=2"))
+    assert experiment.config.num_synergies == 3
+    assert experiment.config.synergies == str(tmp_path / "bundle")

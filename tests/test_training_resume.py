@@ -8,6 +8,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -179,6 +180,33 @@ def test_a_checkpoint_that_could_run_code_is_not_loaded(tmp_path):
     with pytest.warns(UserWarning, match=r"planted\.pkl is not a kind of file"):
         older = Checkpoints(newest.parent, keep_last=2).newest_whole()
     assert older is not None and older != newest
+
+
+@pytest.mark.parametrize(
+    "slow_part", ["explore.fit.final_updates=100000", "vaf_curve.updates=100000"]
+)
+def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
+    slow_part, tmp_path, monkeypatch
+):
+    run = tmp_path / "run"
+    settings = ("pictures=true", "explore.frames=320", slow_part)
+    experiment = Experiment(tiny(f"run_dir='{run}'", *settings))
+    save = Checkpoints.save
+
+    def save_and_signal(self, checkpoint, *, step, **kwargs):
+        folder = save(self, checkpoint, step=step, **kwargs)
+        if step == 320:
+            threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return folder
+
+    monkeypatch.setattr(Checkpoints, "save", save_and_signal)
+    with pytest.raises(Interrupted):
+        experiment.run()
+    monkeypatch.undo()
+    quick = ["explore.fit.final_updates=20", "vaf_curve.updates=20"]
+    summary = Experiment(resumed_config(run, quick), resume=run).run()
+    assert summary["learn"]["frames"] == 608
+    assert (run / "pictures" / "vaf.png").exists()
 
 
 def test_a_longer_budget_can_be_given_when_resuming(tmp_path):

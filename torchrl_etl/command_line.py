@@ -13,7 +13,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-__all__ = ["check_overrides", "draw_without_display", "one_sentence", "quiet_torchrl"]
+__all__ = [
+    "check_overrides",
+    "draw_without_display",
+    "one_sentence",
+    "quiet_torchrl",
+    "quote_paths",
+]
 
 
 def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
@@ -44,6 +50,23 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
             near = difflib.get_close_matches(key, known, n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
+
+
+def quote_paths(arguments: list[str], *keys: str) -> list[str]:
+    """Quote the values of path settings, in which Hydra's grammar allows no bracket or space.
+
+    Examples:
+        >>> quote_paths(["run_dir=/my (new) runs/a", "seed=1"], "run_dir")
+        ["run_dir='/my (new) runs/a'", 'seed=1']
+    """
+    quoted = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key in keys and value not in ("", "null") and value[0] not in "'\"":
+            value = value.replace("'", "\\'")
+            argument = f"{key}='{value}'"
+        quoted.append(argument)
+    return quoted
 
 
 @contextmanager

@@ -131,6 +131,8 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
         finally:
             built.close()
     names = _raw_actuator_names(simulator(env))
+    if len(set(names)) < len(names):  # some models name no actuator, or two alike
+        names = [f"{name or 'actuator'}_{i}" for i, name in enumerate(names)]
     if all(name.endswith("_r") for name in names):
         return [name.removesuffix("_r") for name in names]
     return names

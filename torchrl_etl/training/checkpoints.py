@@ -40,7 +40,10 @@ class Checkpoints(CheckpointRotation):
     def save(self, checkpoint: Checkpoint, *, step: int, **kwargs: Any) -> Path:
         """Save, flush and seal a checkpoint of frame ``step``; returns its folder."""
         self._remove_leftovers()
-        folder = super().save(checkpoint, step=step, **kwargs)
+        try:
+            folder = super().save(checkpoint, step=step, **kwargs)
+        except RuntimeError as error:  # how PyTorch says that the disk is full
+            raise OSError(f"A checkpoint cannot be written to {self.directory}: {error}") from error
         write_atomically(folder / _SEAL, json.dumps(_digests(folder, flush=True), indent=1))
         return folder
 

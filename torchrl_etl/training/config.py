@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torchrl_etl.envs import resolve_task
 
@@ -18,20 +21,125 @@ _CHOICES = {
     "explore.fit.actions": ("mean", "sampled", "activation"),
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
 }
-_POSITIVE = (
-    "num_synergies",
-    "collector.num_envs",
-    "collector.frames_per_batch",
-    "evaluation.episodes",
-    "checkpoint.every",
-    "log_every",
-    *(
-        f"{stage}.{key}"
-        for stage in ("explore", "learn")
-        for key in ("frames", "batch_size", "buffer_size", "updates_per_frame")
+_LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
+
+
+def _both(*keys: str) -> tuple[str, ...]:
+    return tuple(f"{stage}.{key}" for stage in ("explore", "learn") for key in keys)
+
+
+def _integer(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _real(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _widths(value: Any) -> bool:
+    return (
+        isinstance(value, ListConfig) and bool(value) and all(_integer(w) and w > 0 for w in value)
+    )
+
+
+# What is expected, in words; whether a value is that; the keys that must be.
+_Rule = tuple[str, Callable[[Any], bool], tuple[str, ...]]
+_RULES: tuple[_Rule, ...] = (
+    ("a text", lambda v: isinstance(v, str) and v != "", ("env", "run_dir", "device")),
+    (
+        "true or false",
+        lambda v: isinstance(v, bool),
+        (
+            "progress",
+            "pictures",
+            "explore.bonus.normalize",
+            "explore.metric.delay_encoder",
+            "network.layer_norm",
+            *_both("network.layer_norm"),
+        ),
+    ),
+    (
+        "a whole number above 0",
+        lambda v: _integer(v) and v > 0,
+        (
+            "num_synergies",
+            "collector.num_envs",
+            "collector.frames_per_batch",
+            "log_every",
+            "evaluation.episodes",
+            "checkpoint.every",
+            "vaf_curve.updates",
+            "explore.encoder.embedding_dim",
+            *_both("frames"),
+        ),
+    ),
+    (
+        "a whole number above 1",
+        lambda v: _integer(v) and v > 1,
+        ("checkpoint.keep", *_both("batch_size", "buffer_size")),
+    ),
+    (
+        "a whole number from 0 to 2147483647",
+        lambda v: _integer(v) and 0 <= v < 2**31,
+        ("seed", "evaluation.every", "explore.fit.final_updates", *_both("learning_starts")),
+    ),
+    (
+        "a whole number above 0 or null",
+        lambda v: v is None or (_integer(v) and v > 0),
+        ("threads", "explore.gmvae.num_components", "explore.direction.num_directions"),
+    ),
+    (
+        "a number above 0",
+        lambda v: _real(v) and 0 < v < 1e9,
+        (
+            "explore.encoder_lr",
+            "explore.fit.lr",
+            "learn.decoder_lr",
+            "explore.metric.epsilon",
+            "explore.metric.margin",
+            *_both("updates_per_frame", "reward_scale"),
+            *_both("sac.lr", "sac.alpha_init"),
+        ),
+    ),
+    (
+        "a number above 0 or null",
+        lambda v: v is None or (_real(v) and v > 0),
+        _both("sac.action_std"),
+    ),
+    (
+        "a number 0 or more",
+        lambda v: _real(v) and v >= 0,
+        (
+            "learn.anchor",
+            "explore.metric.weight",
+            "explore.bonus.extrinsic_weight",
+            "explore.fit.kl_weight",
+            "explore.fit.component_kl_weight",
+        ),
+    ),
+    (
+        "a share in (0, 1]",
+        lambda v: _real(v) and 0 < v <= 1,
+        ("explore.fit.best_share", "explore.encoder_tau", *_both("sac.tau")),
+    ),
+    ("a share in [0, 1]", lambda v: _real(v) and 0 <= v <= 1, ("learn.residual",)),
+    (
+        "a share in [0, 1)",
+        lambda v: _real(v) and 0 <= v < 1,
+        ("explore.bonus.decay", "explore.metric.gamma", *_both("sac.gamma")),
+    ),
+    (
+        "a list of whole numbers above 0",
+        _widths,
+        (
+            "network.hidden",
+            "explore.encoder.hidden",
+            "explore.gmvae.hidden",
+            "vaf_curve.dims",
+            *_both("network.hidden"),
+        ),
     ),
 )
-_NOT_NEGATIVE = ("seed", "evaluation.every", "explore.learning_starts", "learn.learning_starts")
 
 
 def validate(config: DictConfig) -> None:
@@ -40,23 +148,14 @@ def validate(config: DictConfig) -> None:
     Raises:
         ValueError: naming the key, what came and what is expected.
     """
-    resolve_task(config.env, config.goal)
+    for words, holds, keys in _RULES:
+        for key in keys:
+            value = OmegaConf.select(config, key)
+            if not holds(value):
+                raise ValueError(f"{key} is {value!r}; it must be {words}.")
     for key, choices in _CHOICES.items():
-        check_choice(key, _get(config, key), choices)
-    for key in _POSITIVE:
-        _check_number(key, _get(config, key), least="above 0", fine=lambda value: value > 0)
-    for key in _NOT_NEGATIVE:
-        _check_number(key, _get(config, key), least="0 or more", fine=lambda value: value >= 0)
-    if config.checkpoint.keep < 2:
-        raise ValueError(
-            f"checkpoint.keep is {config.checkpoint.keep}; keep at least 2, so that one is whole "
-            "while the other is being written."
-        )
-    if not 0 < config.explore.fit.best_share <= 1:
-        raise ValueError(
-            f"explore.fit.best_share is {config.explore.fit.best_share}; it is a share of the "
-            "batch and must lie in (0, 1]."
-        )
+        check_choice(key, OmegaConf.select(config, key), choices)
+    resolve_task(config.env, config.goal)
     if config.collector.frames_per_batch % config.collector.num_envs:
         raise ValueError(
             f"collector.frames_per_batch is {config.collector.frames_per_batch} and "
@@ -73,8 +172,7 @@ def validate(config: DictConfig) -> None:
             f"stage=explore finds synergies, but synergies={config.synergies} was given; leave it "
             "out or use stage=learn."
         )
-    for name in config.log:
-        check_choice("log", name, ("csv", "tensorboard", "wandb", "mlflow", "trackio"))
+    _check_loggers(config.log)
     _check_device(config.device)
 
 
@@ -82,23 +180,31 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
     """The configuration of an earlier run, with the overrides given now on top.
 
     Raises:
-        ValueError: if the folder holds no run, or an override swaps a whole group.
+        ValueError: if the folder holds no run, or an override would make it another run.
     """
-    path = folder / "config.yaml"
+    path = Path(folder) / "config.yaml"
     if not path.is_file():
         raise ValueError(
-            f"resume={folder} holds no run (there is no {path.name}); pass the folder that the "
-            "first run printed."
+            f"{folder} holds no run (there is no {path.name}); pass the folder that the first run "
+            "printed."
         )
     given = [override for override in overrides if not override.startswith("resume=")]
-    for group in ("experiment", "faithful"):
-        if any(override.startswith(f"{group}=") for override in given):
+    for override in given:
+        key = override.partition("=")[0].lstrip("+~")
+        if key in _FIXED or any(part in key.split(".") for part in _FIXED_SECTIONS):
             raise ValueError(
-                f"{group}= cannot be changed when a run is resumed; override single values instead."
+                f"{key} cannot be changed when a run is resumed, since its checkpoints were made "
+                "with another; start a new run for that."
             )
     config = OmegaConf.load(path)
     OmegaConf.set_struct(config, True)
     return OmegaConf.merge(config, OmegaConf.from_dotlist(given))
+
+
+# What the shapes of networks, or the meaning of their weights, depend on.
+_FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir", "learn.residual")
+_FIXED += ("experiment", "faithful")
+_FIXED_SECTIONS = ("network", "encoder", "gmvae", "direction", "metric", "collector")
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
@@ -116,21 +222,21 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
 
 
-def _get(config: DictConfig, key: str) -> object:
-    for part in key.split("."):
-        config = config[part]
-    return config
-
-
-def _check_number(name: str, value: object, *, least: str, fine: object) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not fine(value):
-        raise ValueError(f"{name} is {value!r}; it must be a number {least}.")
+def _check_loggers(names: object) -> None:
+    if not isinstance(names, ListConfig):
+        raise ValueError(f"log is {names!r}; it must be a list, such as [tensorboard].")
+    for name in names:
+        check_choice("log", name, _LOGGERS)
+        if name != "csv" and find_spec(name) is None:
+            raise ValueError(f"log names {name}, which is not installed; pip install {name}.")
 
 
 def _check_device(name: str) -> None:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise ValueError(f"device is {name!r}; use cpu, cuda or cuda:0.") from None
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device is {name!r}; use cpu, cuda or cuda:0.")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device is {name!r} but no CUDA device is available; use device=cpu.")

@@ -53,22 +53,22 @@ class Experiment:
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         validate(config)
-        self.config, self.say = config, say
+        self.config, self.say = config.copy(), say
         self.device = torch.device(config.device)
         self.task = resolve_task(config.env, config.goal)
         self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
         if config.synergies is not None:
-            self._check_bundle(config.synergies)
-        if config.num_synergies > len(self.actuators):
+            self._take_bundle()
+        if self.config.num_synergies > len(self.actuators):
             raise ValueError(
                 f"num_synergies is {config.num_synergies} but {config.env} has "
                 f"{len(self.actuators)} actuators; choose at most that many."
             )
         self._build_once()
         self.resume = resume is not None
-        self.folder = RunFolder(resume or Path(config.run_dir), config)
+        self.folder = RunFolder(resume or Path(config.run_dir), self.config)
 
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
@@ -98,15 +98,13 @@ class Experiment:
 
     def explore_stage(self) -> ExploreStage:
         """Stage 1 as configured, before its first frame."""
-        options = self._options("explore")
-        activations = options["fit"]["actions"] == "activation"
         return ExploreStage(
-            partial(self._batched_env, activations=activations),
+            partial(self._batched_env, activations=self._shows_activations),
             self.spec,
             num_synergies=self.config.num_synergies,
             seed=2 * self.config.seed,
             device=self.device,
-            **options,
+            **self._options("explore"),
         )
 
     def _explore(self, stop: StopOnSignal) -> None:
@@ -114,15 +112,13 @@ class Experiment:
         stage = self.explore_stage()
         run_stage(stage, self.folder, stop, **self._loop_options())
         torch.manual_seed(stage.seed)  # finishing gives the same whether or not it was resumed
-        decoder = stage.finish()
+        decoder = stage.finish(stop.check)
         numbers, warnings = describe_synergies(stage.gmvae, decoder, stage.actions())
         numbers["frames"] = stage.frames
         for warning in warnings:
             self.say(f"Warning: {warning}")
         if self.config.pictures:
-            draw_synergies(
-                stage, decoder, self.actuators, self.folder.pictures, **self.config.vaf_curve
-            )
+            self._draw_synergies(stage, decoder, stop)
         save_bundle(
             decoder,
             self.folder.synergies,
@@ -131,6 +127,21 @@ class Experiment:
             num_components=stage.gmvae.num_components,
             facts={**numbers, "seed": self.config.seed, **facts()},
         )
+
+    def _draw_synergies(
+        self, stage: ExploreStage, decoder: SynergyDecoder, stop: StopOnSignal
+    ) -> None:
+        try:
+            draw_synergies(
+                stage,
+                decoder,
+                self.actuators,
+                self.folder.pictures,
+                **self.config.vaf_curve,
+                on_update=stop.check,
+            )
+        except Exception as error:  # whatever a picture meets, the synergies are worth keeping
+            self.say(f"Warning: the pictures of the synergies could not be drawn ({error}).")
 
     # Stage 2 -----------------------------------------------------------------------------------
 
@@ -183,7 +194,7 @@ class Experiment:
     def _learn(self, decoder: SynergyDecoder, charged: int, stop: StopOnSignal) -> dict[str, Any]:
         stage = self.learn_stage(decoder)
         evaluator = self.evaluator(stage)
-        run_stage(
+        last = run_stage(
             stage,
             self.folder,
             stop,
@@ -192,7 +203,7 @@ class Experiment:
             offset=charged,
             **self._loop_options(),
         )
-        after = evaluator()
+        after = last or evaluator()
         if self.config.pictures:
             self._draw_curves(charged)
         summary: dict[str, Any] = {"frames": stage.frames, "frames_charged": charged + stage.frames}
@@ -245,6 +256,7 @@ class Experiment:
         """Let every part object to its arguments now, not when its stage comes."""
         if self.config.synergies is None:
             self.explore_stage()
+            self._batched_env(0, activations=self._shows_activations).close()
         space = self.spec.full_action_spec_unbatched["action"].space
         blank = SynergyDecoder(
             self.config.num_synergies,
@@ -255,7 +267,15 @@ class Experiment:
         )
         self.learn_stage(blank)
 
-    def _check_bundle(self, path: str) -> None:
+    @property
+    def _shows_activations(self) -> bool:
+        return self.config.explore.fit.actions == "activation"
+
+    def _take_bundle(self) -> None:
+        """Check the given bundle, and let its own d and its absolute path stand in the config."""
+        path = Path(self.config.synergies).resolve()
         _, info = load_bundle(path)
+        self.config.synergies = str(path)
+        self.config.num_synergies = info.num_synergies
         space = self.spec.full_action_spec_unbatched["action"].space
         check_compatible(info, self.actuators, space.low.tolist(), space.high.tolist())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -92,10 +93,10 @@ class ExploreStage(Stage):
         self.encoder = StateEncoder(observation_dim, **encoder).to(device)
         self.gmvae = GMVAE.from_spec(action_spec, num_synergies, **gmvae).to(device)
 
+        make_primer = partial(DirectionPrimer, encoder["embedding_dim"], **direction)
+        make_primer()  # objects to its arguments now
         super().__init__(
-            lambda seed: make_base_env(seed).append_transform(
-                DirectionPrimer(encoder["embedding_dim"], **direction)
-            ),
+            lambda seed: make_base_env(seed).append_transform(make_primer()),
             actor,
             device=device,
             **stage,
@@ -173,16 +174,21 @@ class ExploreStage(Stage):
             actions = actions[batch["next", "reward"].squeeze(-1).topk(count).indices]
         return TensorDict({"action": actions}, actions.shape[:1])
 
-    def finish(self) -> SynergyDecoder:
-        """Train the GMVAE on for ``final_updates``; returns the decoder for stage 2."""
+    def finish(self, on_update: Callable[[], None] = lambda: None) -> SynergyDecoder:
+        """Train the GMVAE on for ``final_updates``; returns the decoder for stage 2.
+
+        Args:
+            on_update (callable): called before every update; may raise to stop.
+        """
         for _ in range(self.final_updates):
+            on_update()
             loss = self.gmvae_loss(self._best(self.buffer.sample()))
             gradient_step(self.gmvae_optimizer, loss["loss_gmvae"])
         return SynergyDecoder.from_gmvae(self.gmvae, self.actions())
 
     def actions(self, count: int = 20_000) -> Tensor:
-        """Up to ``count`` of the latest actions that the GMVAE was trained on, [N, n]."""
-        return self.buffer.storage[:]["shown_action"][-count:]
+        """Up to ``count`` of the latest actions shown to the GMVAE, [N, n]."""
+        return self.newest(count)["shown_action"]
 
     def parts(self) -> dict[str, Any]:
         return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable
@@ -26,7 +27,7 @@ class Interrupted(KeyboardInterrupt):
 class StopOnSignal(AbstractContextManager):
     """Turns the first Ctrl-C or SIGTERM into a request to stop at the next safe point.
 
-    A second one interrupts at once.
+    A second one ends the process at once.
     """
 
     def __init__(self) -> None:
@@ -47,9 +48,16 @@ class StopOnSignal(AbstractContextManager):
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
+    def check(self) -> None:
+        """Raise :class:`Interrupted` if a stop was requested."""
+        if self.requested:
+            raise Interrupted
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
-            raise KeyboardInterrupt
+            # Not an exception, which could surface anywhere: the signal does what it always did.
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
         self.requested = True
 
 
@@ -65,7 +73,7 @@ def run_stage(
     log_every: int,
     offset: int = 0,
     show_progress: bool = True,
-) -> None:
+) -> Evaluation | None:
     """Run a stage to the end of its budget, going on from its newest whole checkpoint.
 
     Every checkpoint starts new episodes (see :meth:`Stage.restart_collection`), so a run that was
@@ -83,6 +91,9 @@ def run_stage(
         offset (int): frames charged before this stage.
         show_progress (bool): draw a progress bar.
 
+    Returns:
+        Evaluation, optional: the one after the last frame, if it was made now.
+
     Raises:
         Interrupted: after saving, if a stop was requested.
     """
@@ -91,7 +102,7 @@ def run_stage(
     # A fresh start also forgets the row of frame 0 that a run killed before saving may have left.
     folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
     if stage.finished:
-        return
+        return None
 
     bar = tqdm(
         total=stage.budget,
@@ -101,6 +112,7 @@ def run_stage(
         disable=not show_progress,
         mininterval=0.5,
     )
+    last = None
     report = _Report(stage, folder, bar, offset)
     try:
         if not resumed and evaluate is not None:
@@ -114,7 +126,7 @@ def run_stage(
             if evaluate is not None and (
                 _passed(before, stage.frames, evaluate_every) or stage.finished
             ):
-                report.evaluation(evaluate())
+                report.evaluation(last := evaluate())
             if _passed(before, stage.frames, checkpoint_every) or stage.finished or stop.requested:
                 checkpoints.save(stage.checkpoint(), step=stage.frames)
                 if stop.requested and not stage.finished:
@@ -125,6 +137,7 @@ def run_stage(
     finally:
         bar.close()
         stage.close()
+    return last
 
 
 class _Report:

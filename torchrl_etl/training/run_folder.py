@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 import platform
 import subprocess
@@ -62,7 +63,8 @@ class RunFolder:
 
     def write_json(self, name: str, content: Any) -> Path:
         """Write a JSON file atomically; returns its path."""
-        write_atomically(self.path / name, json.dumps(content, indent=2) + "\n")
+        text = json.dumps(_finite(content), indent=2, allow_nan=False)
+        write_atomically(self.path / name, text + "\n")
         return self.path / name
 
     def checkpoints(self, stage: str) -> Path:
@@ -136,6 +138,15 @@ def facts() -> dict[str, Any]:
         **{name: version(name) for name in _PACKAGES},
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+def _finite(content: Any) -> Any:
+    """JSON knows no NaN (the interval of a single episode, say); null stands for it."""
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def _commit() -> str | None:

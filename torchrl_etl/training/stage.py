@@ -146,6 +146,13 @@ class Stage(ABC):
         logs = [self.update().detach() for _ in range(due)]
         return torch.stack(logs).mean(0) if logs else None
 
+    def newest(self, count: int) -> TensorDictBase:
+        """Up to ``count`` of the latest transitions, oldest first."""
+        rows, writer = self.buffer.storage[:], self.buffer.writer
+        if len(rows) == self.buffer.storage.max_size:  # full: the oldest row is the next to go
+            rows = torch.cat([rows[writer._cursor :], rows[: writer._cursor]])
+        return rows[-count:]
+
     def checkpoint(self) -> Checkpoint:
         """Everything the stage needs to go on, as a TorchRL checkpoint."""
         checkpoint = Checkpoint(**self.parts(), progress=self.progress, rng=GlobalRNGState())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -29,9 +29,23 @@ __all__ = ["describe_synergies", "draw_synergies", "fit_gmvae"]
 
 
 def fit_gmvae(
-    gmvae: GMVAE, actions: Tensor, *, updates: int, batch_size: int = 256, lr: float = 3e-3
+    gmvae: GMVAE,
+    actions: Tensor,
+    *,
+    updates: int,
+    batch_size: int = 256,
+    lr: float = 3e-3,
+    on_update: Callable[[], None] = lambda: None,
 ) -> GMVAE:
     """Train a GMVAE on an array of actions [N, n] by Eq. 9; returns it.
+
+    Args:
+        gmvae (GMVAE): trained in place.
+        actions (Tensor): [N, n], in action units.
+
+    Keyword Args:
+        updates, batch_size (int), lr (float): of Adam.
+        on_update (callable): called before every update; may raise to stop.
 
     Examples:
         >>> import torch
@@ -45,6 +59,7 @@ def fit_gmvae(
     loss_module = GMVAELoss(gmvae)
     optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr)
     for _ in range(updates):
+        on_update()
         chosen = actions[torch.randint(len(actions), (batch_size,), device=actions.device)]
         loss = loss_module(TensorDict({"action": chosen}, [batch_size]))
         gradient_step(optimizer, loss["loss_gmvae"])
@@ -84,6 +99,7 @@ def draw_synergies(
     *,
     dims: Sequence[int],
     updates: int,
+    on_update: Callable[[], None] = lambda: None,
 ) -> None:
     """Heat map over named muscles, VAF against d beside PCA and NMF, state embedding.
 
@@ -97,6 +113,7 @@ def draw_synergies(
         dims (sequence of int): numbers of synergies on the VAF curve; those above n are left out.
         updates (int): updates that a fresh GMVAE gets at every d, the same for all, so that the
             curve compares dimensions and not training times; the stage's own had more.
+        on_update (callable): called before every update; may raise to stop.
     """
     synergy_heatmap(decoder, names, folder / "synergies.png")
 
@@ -108,14 +125,14 @@ def draw_synergies(
             fresh = GMVAE(
                 gmvae.action_dim, d, gmvae.num_components, low=gmvae.low, high=gmvae.high
             ).to(actions.device)
-            fit_gmvae(fresh, actions, updates=updates)
+            fit_gmvae(fresh, actions, updates=updates, on_update=on_update)
             with torch.no_grad():
                 series["GMVAE"].append(variance_accounted_for(actions, fresh.reconstruct(actions)))
             series["PCA"].append(pca_vaf(actions, d))
             series["NMF"].append(nmf_vaf(actions, d, low=gmvae.low))
     vaf_curve(dims, series, folder / "vaf.png", chosen_d=gmvae.latent_dim)
 
-    visited = stage.buffer.storage[:][-5000:]
+    visited = stage.newest(5000)
     with torch.no_grad():
         embedded = stage.encoder(visited.select("observation"))["embedding"]
     embedding(embedded, visited["direction"], folder / "embedding.png")
