@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig, MissingMandatoryValue
+from omegaconf import DictConfig
 
 from torchrl_etl.command_line import (
     check_overrides,
@@ -30,7 +30,9 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError, MissingMandatoryValue):
+    with one_sentence(ValueError, OSError):
+        if config.run is None:
+            raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         run = Path(config.run)
         trained = resumed_config(
             run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]

@@ -128,9 +128,7 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "options", ["env=Pendulum-v1 num_synergies=1", "faithful=paper", "learn.residual=0.2"]
-)
+@pytest.mark.parametrize("options", ["env=Walker2d-v5", "faithful=paper", "learn.residual=0.2"])
 def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path):
     done = run("etl_sac.py", *TINY, *options.split(), f"run_dir='{tmp_path}/run'", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -145,7 +143,8 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("etl_sac.py", "learn.frame=3", "learn.frames"),
         ("etl_sac.py", "env=myoHandPos", "myoHandPose"),
         ("etl_sac.py", "myoHandPose", "not of the form key=value"),
-        ("evaluate.py", "run=nowhere", "holds no run"),
+        ("evaluate.py", "run=no (where)", "holds no run"),
+        ("evaluate.py", "episodes=3", "no run is named; pass run=PATH"),
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],
 )
