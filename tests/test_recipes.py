@@ -182,7 +182,7 @@ def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert f"resume='{folder}'" in output
+    assert f"resume={folder}" in output
     assert "Traceback" not in output
 
 
