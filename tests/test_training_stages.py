@@ -200,3 +200,11 @@ def test_restarting_collection_lets_the_old_simulators_go():
     assert simulators() == before
     stage.close()
     assert simulators() == before - 4
+
+
+def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
+    stage = explore_stage("explore.buffer_size=100")
+    for _ in range(5):
+        batch = stage.collect()
+    assert torch.equal(stage.newest(32)["action"], batch["action"])
+    stage.close()
