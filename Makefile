@@ -1,5 +1,6 @@
 # make demo: both stages of ETL on a MyoSuite hand, in a few minutes.
 # make test: the whole test suite, in the same environment.
+# make bench: speed and memory beside their peers, into docs/performance.md; under 20 minutes.
 # make smoke: both stages on each of the paper's 13 tasks, for as long as it takes to see them run.
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 export MPLBACKEND := Agg
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test smoke lint lock clean
+.PHONY: demo test bench smoke lint lock clean
 
 demo: $(VENV)/.complete
 	$(BIN)/python recipes/etl_sac.py env=myoHandPenTwirl experiment=demo
@@ -22,6 +23,15 @@ smoke: $(VENV)/.complete
 	set -e; for task in $$($(BIN)/python recipes/list_tasks.py names); do \
 	  $(BIN)/python recipes/etl_sac.py env=$$task experiment=smoke progress=false; \
 	done
+
+bench: $(VENV)/.complete .venv-peers/.complete
+	$(BIN)/python benchmarks/bench.py --peer .venv-peers/bin/python --write
+
+# Stable-Baselines3 lives apart: it may want other versions than we do.
+.venv-peers/.complete: benchmarks/peers.lock
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet --no-deps -r benchmarks/peers.lock
+	touch $@
 
 lint: $(VENV)/.complete
 	$(BIN)/ruff check .
@@ -41,4 +51,4 @@ lock:
 	$(BIN)/python -m pip freeze --exclude-editable --all | grep -v '^pip==' | sed 's/+cpu//' > requirements.lock
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) .venv-peers

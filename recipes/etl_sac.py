@@ -21,6 +21,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
@@ -40,7 +41,7 @@ def main(config: DictConfig) -> None:
     folder = experiment.folder.path
     print(f"Run folder: {folder}")
     try:
-        with one_sentence(OSError, SimulationError):
+        with one_sentence(OSError, SimulationError, CollectionError):
             summary = experiment.run()
     except Interrupted:
         command = shlex.join(["python", sys.argv[0], f"resume={folder}"])

@@ -354,6 +354,13 @@ def test_layer_norm_follows_every_hidden_layer_or_none(layer_norm: bool) -> None
         assert norms == ([(16,), (12,)] if layer_norm else [])
 
 
+def test_a_critic_is_a_perceptron_on_its_joined_inputs():
+    critic = make_critic({"observation": 3, "direction": 2, "action": 4}, hidden=(8,))
+    inputs = [torch.randn(2, 5, size) for size in (3, 2, 4)]
+    joined = nn.Sequential(*critic.module)(torch.cat(inputs, -1))
+    torch.testing.assert_close(critic.module(*inputs), joined)
+
+
 @pytest.mark.parametrize("action", ["action", "synergy", ("arm", "action")])
 def test_critic_writes_a_state_action_value_whatever_the_action_is_called(action: object) -> None:
     critic = make_critic({"observation": 3, action: 2}, hidden=(8,))

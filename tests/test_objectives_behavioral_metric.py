@@ -260,10 +260,10 @@ def test_bootstrapped_distances_stay_bounded(divergence: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"divergence": "w2"}, "divergence is 'w2'; choose one of 'sampled', 'gaussian'"),
-        ({"distance": "cosine"}, "choose one of 'l2', 'mico'"),
-        ({"regularizer": "paper"}, "choose one of 'hinge', 'literal', 'none'"),
-        ({"pairs": "some"}, "choose one of 'permuted', 'all'"),
+        ({"divergence": "w2"}, "divergence is 'w2'; choose one of sampled, gaussian"),
+        ({"distance": "cosine"}, "choose one of l2, mico"),
+        ({"regularizer": "paper"}, "choose one of hinge, literal, none"),
+        ({"pairs": "some"}, "choose one of permuted, all"),
         ({"divergence": "gaussian"}, "pass GaussianDynamics"),
         ({"dynamics": GaussianDynamics(2)}, "does not read it"),
         (

@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from tests.configs import ROOT, TINY, tiny
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
@@ -217,18 +218,26 @@ def test_a_longer_budget_can_be_given_when_resuming(tmp_path):
     assert summary["learn"]["frames"] == 640
 
 
-def test_learner_state_is_bit_exact_after_a_load(tmp_path):
-    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'"))
-    stage = experiment.explore_stage()
+@pytest.mark.parametrize("compile", ["false", pytest.param("true", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["explore", "learn"])
+def test_learner_state_is_bit_exact_after_a_load(name, compile, tmp_path):
+    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", f"compile={compile}"))
+
+    def fresh():
+        if name == "explore":
+            return experiment.explore_stage()
+        return experiment.learn_stage(SynergyDecoder(2, 16, hidden=(32, 32)))
+
+    stage = fresh()
     stage.restart_collection()
     for _ in range(4):
         stage.collect()
         stage.update()
     stage.checkpoint().save(tmp_path / "saved")
-    twin = experiment.explore_stage()
+    twin = fresh()
     twin.checkpoint().load(tmp_path / "saved")
     rows = []
-    for one in (stage, twin):
+    for one in (stage, twin):  # the first is compiled by now, the second is not
         torch.manual_seed(0)
         rows.append(torch.stack([one.update() for _ in range(3)]))
     assert (rows[0] == rows[1]).all()

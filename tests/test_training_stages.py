@@ -208,3 +208,35 @@ def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
         batch = stage.collect()
     assert torch.equal(stage.newest(32)["action"], batch["action"])
     stage.close()
+
+
+@pytest.mark.slow
+def test_a_compiled_update_is_the_same_update():
+    stages = [learn_stage(None, f"compile={compile}") for compile in ("false", "true")]
+    fill(stages[0])
+    batch = stages[0].buffer.sample()
+    stages[1].sac.load_state_dict(stages[0].sac.state_dict())
+    outs = []
+    for stage in stages:
+        torch.manual_seed(0)
+        outs.append((*stage._gradients(batch.clone()),))
+        stage.close()
+    (eager, logged), (compiled, logged_too) = outs
+    for one, two in zip(eager, compiled, strict=True):
+        torch.testing.assert_close(two, one, rtol=1e-3, atol=1e-5)
+    for key, value in logged.items():
+        torch.testing.assert_close(logged_too[key], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("make", [explore_stage, lambda *args: learn_stage(None, *args)])
+def test_updates_learn_from_a_cuda_graph(make):
+    stage = make("compile=true", "device=cuda")
+    fill(stage)
+    before = snapshot(stage.policy)
+    for _ in range(20):  # warm-up, capture, replay
+        assert all(value.isfinite() for value in stage.update().values())
+    assert changed(stage.policy, before)
+    stage.close()

@@ -37,9 +37,13 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
         settings, _, _ = text.partition("\nhydra:")
         print(usage.strip(), settings, sep="\n\n")
         sys.exit()
-    groups = OmegaConf.create(text).get("defaults", [])
     known = list(_keys(OmegaConf.create(text)))
-    known += [name for entry in groups if isinstance(entry, DictConfig) for name in entry]
+    defaults = OmegaConf.create(text).get("defaults", [])
+    for group in [name for entry in defaults if isinstance(entry, DictConfig) for name in entry]:
+        known.append(group)
+        for choice in (config.parent / group).glob("*.yaml"):
+            prefix = "" if "@package _global_" in choice.read_text("utf-8") else f"{group}."
+            known += _keys(OmegaConf.load(choice), prefix)
     for argument in arguments:
         key, separator, _ = argument.partition("=")
         if argument.startswith(("-", "+", "~")) or key.startswith("hydra"):

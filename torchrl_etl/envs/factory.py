@@ -19,9 +19,9 @@ from torchrl_etl.envs.tasks import Goal, Task, resolve_task
 from torchrl_etl.envs.wrappers import (
     SUCCESS_KEYS,
     FiniteGuard,
+    FlatObservation,
     NamedObservation,
     SeededVectorEnv,
-    SinglePrecision,
 )
 
 __all__ = ["actuator_names", "make_env"]
@@ -176,9 +176,12 @@ def _build(task: Task, *, activations: bool, env_kwargs: dict[str, Any]) -> gym.
     success_key = "solved" if task.solved else None
     if task.solved is None:
         success_key = _probe_success(env)
-    if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
+    space = env.observation_space
+    if isinstance(space, spaces.Dict) and all(isinstance(s, spaces.Box) for s in space.values()):
+        env = FlatObservation(env)
+    elif not isinstance(space, spaces.Box) or len(space.shape) != 1:
         env = FlattenObservation(env)
-    env = FiniteGuard(SinglePrecision(env), task.name, faults)
+    env = FiniteGuard(env, task.name, faults)
     return NamedObservation(env, success_key, activations=activations)
 
 

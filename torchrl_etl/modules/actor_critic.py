@@ -5,17 +5,35 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule, TensorDictSequential
+from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
 __all__ = ["make_actor", "make_critic"]
 
 
+class _Body(MLP):
+    """A perceptron on several inputs that are never joined.
+
+    Hence no gradient is computed for an input that needs none: under the actor loss the critics'
+    inputs are the action, whose gradient is wanted, and the observation, whose is not.
+    """
+
+    def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
+        first, *rest = self
+        weights = first.weight.split([tensor.shape[-1] for tensor in inputs], dim=-1)
+        hidden = nn.functional.linear(inputs[0], weights[0], first.bias)
+        for tensor, weight in zip(inputs[1:], weights[1:], strict=True):
+            hidden = hidden + nn.functional.linear(tensor, weight)
+        for layer in rest:
+            hidden = layer(hidden)
+        return hidden
+
+
 def _body(in_features: int, out_features: int, hidden: Sequence[int], layer_norm: bool) -> MLP:
-    return MLP(
+    return _Body(
         in_features,
         out_features,
         num_cells=list(hidden),
@@ -64,13 +82,9 @@ def make_actor(
     with torch.no_grad():
         body[-1].weight.mul_(0.01)
         body[-1].bias.zero_()
-    extractor = NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3)
+    body.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
     return ProbabilisticActor(
-        TensorDictSequential(
-            TensorDictModule(body, in_keys=list(inputs), out_keys=["normal_params"]),
-            TensorDictModule(extractor, in_keys=["normal_params"], out_keys=["loc", "scale"]),
-            selected_out_keys=["loc", "scale"],
-        ),
+        TensorDictModule(body, in_keys=list(inputs), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=[out_key],
         spec=action_spec,

@@ -2,7 +2,26 @@
 
 from __future__ import annotations
 
-__all__ = ["check_positive"]
+import difflib
+from collections.abc import Sequence
+
+__all__ = ["check_choice", "check_positive"]
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Raise a ``ValueError`` that lists the choices and names the nearest.
+
+    Examples:
+        >>> check_choice("stage", "learn", ("explore", "learn", "all"))
+        >>> check_choice("stage", "lern", ("explore", "learn", "all"))
+        Traceback (most recent call last):
+        ...
+        ValueError: stage is 'lern'; choose one of explore, learn, all (nearest: learn).
+    """
+    if value not in choices:
+        near = difflib.get_close_matches(str(value), choices, n=1)
+        hint = f" (nearest: {near[0]})" if near else ""
+        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
 
 
 def check_positive(**sizes: int) -> None:

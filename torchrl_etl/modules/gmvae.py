@@ -91,7 +91,11 @@ class ActionDecoder(nn.Module):
         self.register_buffer("high", high)
 
     def forward(self, latent: Tensor) -> Tensor:
-        return self.denormalize(torch.tanh(self.mlp(latent)))
+        return self.denormalize(self.unit(latent))
+
+    def unit(self, latent: Tensor) -> Tensor:
+        """The action where its bounds are [-1, 1]."""
+        return torch.tanh(self.mlp(latent))
 
     def normalize(self, action: Tensor) -> Tensor:
         """Map [low, high] to [-1, 1]."""

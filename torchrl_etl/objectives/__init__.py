@@ -3,6 +3,15 @@
 from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
 from torchrl_etl.objectives.decoder import DecoderLoss
 from torchrl_etl.objectives.gmvae import GMVAELoss
+from torchrl_etl.objectives.sac import LeanSACLoss
+from torchrl_etl.objectives.soft_update import FusedSoftUpdate
 from torchrl_etl.objectives.synergy_sac import SynergySACLoss
 
-__all__ = ["BehavioralMetricLoss", "DecoderLoss", "GMVAELoss", "SynergySACLoss"]
+__all__ = [
+    "BehavioralMetricLoss",
+    "DecoderLoss",
+    "FusedSoftUpdate",
+    "GMVAELoss",
+    "LeanSACLoss",
+    "SynergySACLoss",
+]

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.objectives.checks import check_choice, check_parts
+from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["BehavioralMetricLoss"]
 
@@ -277,7 +278,7 @@ class BehavioralMetricLoss(LossModule):
 
     def _embed(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
         """Embeddings [samples, k]."""
-        with params.to_module(self.encoder):
+        with params.to_module(self.encoder, preserve_module_state=False):
             written = self.encoder(tensordict.select(*self.encoder.in_keys))
         return written.get(self.encoder.out_keys[0]).flatten(0, -2)
 
@@ -286,7 +287,7 @@ class BehavioralMetricLoss(LossModule):
         with torch.no_grad():
             embedding = self._embed(tensordict, self.target_encoder_params)
         inputs = TensorDict({self.dynamics.in_keys[0]: embedding}, embedding.shape[:-1])
-        with self.dynamics_params.to_module(self.dynamics):
+        with self.dynamics_params.to_module(self.dynamics, preserve_module_state=False):
             written = self.dynamics(inputs)
         return written.get(self.dynamics.out_keys[0]), written.get(self.dynamics.out_keys[1])
 

@@ -1,27 +1,10 @@
-"""Argument checks that several losses share."""
+"""An argument check that several losses share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import nn
 
-__all__ = ["check_choice", "check_parts"]
-
-
-def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Raise a ``ValueError`` naming the valid choices when ``value`` is not among them.
-
-    Examples:
-        >>> from torchrl_etl.objectives.checks import check_choice
-        >>> check_choice("reduction", "mean", ("mean", "sum", "none"))
-        >>> check_choice("reduction", "avg", ("mean", "sum", "none"))
-        Traceback (most recent call last):
-        ...
-        ValueError: reduction is 'avg'; choose one of 'mean', 'sum', 'none'.
-    """
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(map(repr, choices))}.")
+__all__ = ["check_parts"]
 
 
 def check_parts(name: str, module: object, kind: type[nn.Module], *, outputs: int = 0) -> None:

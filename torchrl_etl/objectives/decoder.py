@@ -11,7 +11,8 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl.functional import reconstruction_loss
-from torchrl_etl.objectives.checks import check_choice, check_parts
+from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["DecoderLoss"]
 
@@ -101,7 +102,7 @@ class DecoderLoss(LossModule):
         synergy = tensordict.get(self.tensor_keys.synergy).detach()
         action = tensordict.get(self.tensor_keys.action).detach()
         inputs = TensorDict({self.decoder.in_keys[0]: synergy}, synergy.shape[:-1])
-        with self.decoder_params.to_module(self.decoder):
+        with self.decoder_params.to_module(self.decoder, preserve_module_state=False):
             decoded = self.decoder(inputs).get(self.decoder.out_keys[0])
         loss = reconstruction_loss(decoded, action)
         return TensorDict({"loss_decoder": self._reduce_loss(loss, tensordict)})

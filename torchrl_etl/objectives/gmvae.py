@@ -13,7 +13,8 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
 from torchrl_etl.modules import GMVAE
-from torchrl_etl.objectives.checks import check_choice, check_parts
+from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["GMVAELoss"]
 
@@ -115,13 +116,13 @@ class GMVAELoss(LossModule):
         """
         action = tensordict.get(self.tensor_keys.action).detach()
         gmvae = self.gmvae
-        with self.gmvae_params.to_module(gmvae):
+        with self.gmvae_params.to_module(gmvae, preserve_module_state=False):
             posterior = gmvae.encode(action)
             # Drawn by hand: inside a loss TorchRL turns every distribution's sample into its mode.
             latent = posterior.loc + posterior.scale * torch.randn_like(posterior.loc)
             terms = functional.gmvae_bound(
                 gmvae.normalize(action),
-                gmvae.normalize(gmvae.decode(latent)),
+                gmvae.decoder.unit(latent),
                 gmvae.likelihood_scale,
                 *posterior,
                 gmvae.prior_loc,

@@ -5,22 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
-    TensorDictModuleBase,
 )
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import SACLoss
 
-from torchrl_etl.objectives.checks import check_choice, check_parts
+from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.sac import LeanSACLoss, call
 
 __all__ = ["SynergySACLoss"]
 
 
-class SynergySACLoss(SACLoss):
+class SynergySACLoss(LeanSACLoss):
     """SAC in synergy space with critics on the executed action.
 
     The actor emits coefficients z^a; the critics value Q(s, a). Where the loss draws fresh
@@ -41,8 +40,8 @@ class SynergySACLoss(SACLoss):
 
     Keyword Args:
         train_decoder (bool): let ``loss_actor`` reach the decoder. Default: ``True``.
-        **kwargs: see :class:`torchrl.objectives.SACLoss`; give ``action_spec`` unbatched, of the
-            coefficients.
+        **kwargs: see :class:`~torchrl_etl.objectives.LeanSACLoss`; give ``action_spec`` unbatched,
+            of the coefficients.
 
     Keys:
         those of SACLoss, with the critics' action (root entry [*, n], the executed one) in place
@@ -84,7 +83,7 @@ class SynergySACLoss(SACLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(SACLoss._AcceptedKeys):
+    class _AcceptedKeys(LeanSACLoss._AcceptedKeys):
         """SACLoss's keys; ``action`` is where the loss puts the coefficients it draws.
 
         Attributes:
@@ -110,12 +109,7 @@ class SynergySACLoss(SACLoss):
         train_decoder: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_parts("decoder", decoder, TensorDictModuleBase, outputs=1)
-        check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
-        if kwargs.get("value_network") is not None:
-            raise TypeError(
-                "value_network is given but SynergySACLoss bootstraps on its critics; leave it out."
-            )
+        check_parts("decoder", decoder, TensorDictModule, outputs=1)
         sampled, decoded = list(actor_network.dist_sample_keys), list(decoder.out_keys)
         if (
             list(decoder.in_keys) != sampled
@@ -155,34 +149,12 @@ class SynergySACLoss(SACLoss):
         following = (unravel_key(("next", key)) for key in (*observed, *ends))
         self._in_keys = list(dict.fromkeys((*observed, self.decoded_key, *following)))
 
-    @property
-    def _cached_detached_qvalue_params(self) -> TensorDictBase:
-        # SACLoss caches these, and a copy of a used loss then keeps the original's values.
-        return self.qvalue_network_params.detach()
+    def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
+        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        return inputs.set(self.decoded_key, self._decode(action))
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """See :meth:`torchrl.objectives.SACLoss.actor_loss`."""
-        # A shallow copy: the actor writes its loc and scale, graph and all, into what it reads.
-        return super().actor_loss(tensordict.copy())
-
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        # A bound method and not a closure: a deep copy of the loss is then bound to the copy.
-        self._vmap_critics, self._vmap_qnetworkN0 = self._vmap_qnetworkN0, self._decode_then_value
-
-    def _decode_then_value(self, data: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        # SACLoss puts a sample here only when it is fresh; replayed transitions come with the
-        # critics' own keys alone, so their executed action is left as it is.
-        if self.tensor_keys.action in data.keys(True):
-            data = data.copy().set(self.decoded_key, self._decode(data))
-        return self._vmap_critics(data, params)
-
-    def _decode(self, data: TensorDictBase) -> Tensor:
-        decoder, params = self.decoder_network, self.decoder_network_params
-        sample = TensorDict(
-            {decoder.in_keys[0]: data.get(self.tensor_keys.action)}, data.batch_size
-        )
-        with (params if self.train_decoder else params.detach()).to_module(
-            decoder, preserve_module_state=False
-        ):
-            return decoder(sample).get(self.decoded_key)
+    def _decode(self, synergy: Tensor) -> Tensor:
+        weights = self._weights("decoder_network")
+        if not self.train_decoder:
+            weights = {name: weight.detach() for name, weight in weights.items()}
+        return call(self.decoder_network, weights, synergy)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -12,13 +11,18 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
+from torchrl_etl.modules.checks import check_choice
 
 __all__ = ["resumed_config", "validate"]
 
 _CHOICES = {
+    "collector.kind": COLLECTORS,
     "stage": ("explore", "learn", "all"),
     "explore.fit.actions": ("mean", "sampled", "activation"),
+    "explore.buffer_storage": ("memory", "memmap"),
+    "learn.buffer_storage": ("memory", "memmap"),
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
 }
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
@@ -50,8 +54,10 @@ _RULES: tuple[_Rule, ...] = (
         "true or false",
         lambda v: isinstance(v, bool),
         (
+            "compile",
             "progress",
             "pictures",
+            "collector.ahead",
             "explore.bonus.normalize",
             "explore.metric.delay_encoder",
             "network.layer_norm",
@@ -64,6 +70,7 @@ _RULES: tuple[_Rule, ...] = (
         (
             "num_synergies",
             "collector.num_envs",
+            "collector.num_workers",
             "collector.frames_per_batch",
             "log_every",
             "evaluation.episodes",
@@ -92,6 +99,7 @@ _RULES: tuple[_Rule, ...] = (
         "a number above 0",
         lambda v: _real(v) and 0 < v < 1e9,
         (
+            "collector.timeout",
             "explore.encoder_lr",
             "explore.fit.lr",
             "learn.decoder_lr",
@@ -156,12 +164,7 @@ def validate(config: DictConfig) -> None:
     for key, choices in _CHOICES.items():
         check_choice(key, OmegaConf.select(config, key), choices)
     resolve_task(config.env, config.goal)
-    if config.collector.frames_per_batch % config.collector.num_envs:
-        raise ValueError(
-            f"collector.frames_per_batch is {config.collector.frames_per_batch} and "
-            f"collector.num_envs is {config.collector.num_envs}; the first must be a multiple of "
-            "the second, since every environment gives as many frames."
-        )
+    _check_collector(config.collector)
     if config.stage == "learn" and config.synergies is None:
         raise ValueError(
             "stage=learn needs synergies=PATH, the run folder or bundle of an earlier exploration; "
@@ -203,23 +206,23 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 # What the shapes of networks, or the meaning of their weights, depend on.
 _FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir", "learn.residual")
-_FIXED += ("experiment", "faithful")
-_FIXED_SECTIONS = ("network", "encoder", "gmvae", "direction", "metric", "collector")
+_FIXED += ("experiment", "faithful", "collector")  # groups; collector.kind may change
+_FIXED_SECTIONS = ("network", "encoder", "gmvae", "direction", "metric")
 
 
-def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Raise a ``ValueError`` that names the nearest choice.
-
-    Examples:
-        >>> check_choice("stage", "lern", ("explore", "learn", "all"))
-        Traceback (most recent call last):
-        ...
-        ValueError: stage is 'lern'; choose one of explore, learn, all (nearest: learn).
-    """
-    if value not in choices:
-        near = difflib.get_close_matches(str(value), choices, n=1)
-        hint = f" (nearest: {near[0]})" if near else ""
-        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
+def _check_collector(collector: DictConfig) -> None:
+    # A batch comes from all workers, or from one of them.
+    workers = collector.num_workers if collector.kind == "process" else 1
+    if collector.frames_per_batch % (workers * collector.num_envs):
+        raise ValueError(
+            f"collector.frames_per_batch is {collector.frames_per_batch} and a batch comes from "
+            f"{workers} x {collector.num_envs} environments (workers x collector.num_envs); it "
+            "must be a multiple of their number, since every environment gives as many frames."
+        )
+    if collector.kind == "ray" and find_spec("ray") is None:
+        raise ValueError(
+            "collector.kind is 'ray', which is not installed; pip install 'ray>=2.50'."
+        )
 
 
 def _check_loggers(names: object) -> None:

@@ -11,9 +11,11 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 
 from torchrl_etl.analysis import learning_curves
+from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import actuator_names, episode_length, make_env, resolve_task
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.atomic_files import surviving_folder
@@ -55,6 +57,7 @@ class Experiment:
         validate(config)
         self.config, self.say = config.copy(), say
         self.device = torch.device(config.device)
+        self.path = resume or Path(config.run_dir)
         self.task = resolve_task(config.env, config.goal)
         self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
         self.spec = self.make_env()
@@ -68,7 +71,7 @@ class Experiment:
             )
         self._build_once()
         self.resume = resume is not None
-        self.folder = RunFolder(resume or Path(config.run_dir), self.config)
+        self.folder = RunFolder(self.path, self.config)
 
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
@@ -99,7 +102,7 @@ class Experiment:
     def explore_stage(self) -> ExploreStage:
         """Stage 1 as configured, before its first frame."""
         return ExploreStage(
-            partial(self._batched_env, activations=self._shows_activations),
+            self._env_maker(activations=self._shows_activations),
             self.spec,
             num_synergies=self.config.num_synergies,
             seed=2 * self.config.seed,
@@ -148,7 +151,7 @@ class Experiment:
     def learn_stage(self, decoder: SynergyDecoder) -> LearnStage:
         """Stage 2 as configured, before its first frame."""
         return LearnStage(
-            self._batched_env,
+            self._env_maker(),
             self.spec,
             decoder,
             seed=2 * self.config.seed + 1,
@@ -169,7 +172,7 @@ class Experiment:
                 "begun to learn."
             )
         stage = self.learn_stage(self._decoder()[0])
-        Checkpoint(actor=stage.policy, decoder=stage.decoder).load(folder)
+        Checkpoint(actor=stage.actor, decoder=stage.decoder).load(folder)
         return stage
 
     def _decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
@@ -185,7 +188,7 @@ class Experiment:
         steps = episode_length(self.config.env, self.config.goal) or 1000
         return partial(
             evaluate,
-            stage.policy,
+            stage.actor,
             self.evaluation_env(stage),
             episodes=self.config.evaluation.episodes,
             max_steps=steps,
@@ -233,16 +236,26 @@ class Experiment:
 
     # Shared ------------------------------------------------------------------------------------
 
-    def _batched_env(self, seed: int, *, activations: bool = False) -> TransformedEnv:
-        env = self.make_env(
-            num_envs=self.config.collector.num_envs, seed=seed, activations=activations
+    def _env_maker(self, *, activations: bool = False) -> Callable[[], TransformedEnv]:
+        """Builds the simulators of one collector; it is sent to other processes as it is."""
+        return partial(
+            _env_of_a_collector,
+            self.config.env,
+            goal=self.config.goal,
+            num_envs=self.config.collector.num_envs,
+            activations=activations,
         )
-        return TransformedEnv(env, RewardSum())
 
     def _options(self, stage: str) -> dict[str, Any]:
         options = OmegaConf.to_container(self.config[stage], resolve=True)
         options.pop("residual", None)  # an option of the decoder, taken when its bundle is loaded
-        return {"frames_per_batch": self.config.collector.frames_per_batch, **options}
+        collector = OmegaConf.to_container(self.config.collector, resolve=True)
+        batched = collector.pop("num_envs") > 1
+        collector["collector_class"] = VectorCollector if batched else Collector
+        for engine in ("ray", "distributed"):
+            collector[engine] = OmegaConf.to_container(self.config[engine], resolve=True)
+        own = {"compile": self.config.compile, "scratch": self.path / "buffer"}
+        return {"collector": collector, **own, **options}
 
     def _loop_options(self) -> dict[str, Any]:
         return {
@@ -256,7 +269,7 @@ class Experiment:
         """Let every part object to its arguments now, not when its stage comes."""
         if self.config.synergies is None:
             self.explore_stage()
-            self._batched_env(0, activations=self._shows_activations).close()
+            self._env_maker(activations=self._shows_activations)().close()
         space = self.spec.full_action_spec_unbatched["action"].space
         blank = SynergyDecoder(
             self.config.num_synergies,
@@ -279,3 +292,7 @@ class Experiment:
         self.config.num_synergies = info.num_synergies
         space = self.spec.full_action_spec_unbatched["action"].space
         check_compatible(info, self.actuators, space.low.tolist(), space.high.tolist())
+
+
+def _env_of_a_collector(name: str, **kwargs: Any) -> TransformedEnv:
+    return TransformedEnv(make_env(name, **kwargs, device="cpu"), RewardSum())

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.modules import (
     GMVAE,
@@ -20,8 +19,19 @@ from torchrl_etl.modules import (
     make_actor,
     make_critic,
 )
-from torchrl_etl.objectives import BehavioralMetricLoss, GMVAELoss
-from torchrl_etl.training.stage import Stage, entropy_target, gradient_step
+from torchrl_etl.objectives import (
+    BehavioralMetricLoss,
+    FusedSoftUpdate,
+    GMVAELoss,
+    LeanSACLoss,
+)
+from torchrl_etl.training.stage import (
+    Stage,
+    entropy_target,
+    gradient_step,
+    make_optimizer,
+    ready_for_training,
+)
 from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward
 
 __all__ = ["ExploreStage"]
@@ -42,7 +52,7 @@ class ExploreStage(Stage):
     ``final_updates`` (Algorithm 1 stops with the last frame: 0).
 
     Args:
-        make_base_env (callable): seed → environment to which ETL's transforms are appended.
+        make_base_env (callable): environment to which the direction is added.
         spec (EnvBase): any instance of that environment, to read sizes and bounds from.
 
     Keyword Args:
@@ -66,7 +76,7 @@ class ExploreStage(Stage):
 
     def __init__(
         self,
-        make_base_env: Callable[[int], TransformedEnv],
+        make_base_env: Callable[[], TransformedEnv],
         spec: EnvBase,
         *,
         num_synergies: int,
@@ -96,7 +106,7 @@ class ExploreStage(Stage):
         make_primer = partial(DirectionPrimer, encoder["embedding_dim"], **direction)
         make_primer()  # objects to its arguments now
         super().__init__(
-            lambda seed: make_base_env(seed).append_transform(make_primer()),
+            lambda: make_base_env().append_transform(make_primer()),
             actor,
             device=device,
             **stage,
@@ -104,7 +114,7 @@ class ExploreStage(Stage):
         self.bonus = IntrinsicReward(self.encoder, **bonus)
         self.buffer.append_transform(self.bonus)
 
-        self.sac = SACLoss(
+        self.sac = LeanSACLoss(
             actor,
             critic,
             action_spec=action_spec,
@@ -112,24 +122,24 @@ class ExploreStage(Stage):
             alpha_init=sac["alpha_init"],
         ).to(device)
         self.sac.set_keys(reward="intrinsic_reward")
-        self.sac.make_value_estimator(gamma=sac["gamma"])
-        _ = self.sac.target_entropy  # created lazily; it must exist before the optimizer does
-        self.sac_optimizer = torch.optim.Adam(self.sac.parameters(), lr=sac["lr"])
-        self.sac_target = SoftUpdate(self.sac, tau=sac["tau"])
+        self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
 
         dynamics = None
         if metric.get("divergence") == "gaussian":
             dynamics = GaussianDynamics(self.encoder.embedding_dim).to(device)
         self.metric = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(device)
-        self.metric_optimizer = torch.optim.Adam(self.metric.parameters(), lr=encoder_lr)
-        self.metric_target = (
-            SoftUpdate(self.metric, tau=encoder_tau) if metric["delay_encoder"] else None
-        )
+        if metric["delay_encoder"]:
+            self.targets.append(FusedSoftUpdate(self.metric, tau=encoder_tau))
 
         fit = dict(fit)
         self.fit_actions: GMVAEActions = fit.pop("actions")
         self.best_share, self.final_updates = fit.pop("best_share"), fit.pop("final_updates")
-        self.gmvae_optimizer = torch.optim.Adam(self.gmvae.parameters(), lr=fit.pop("lr"))
+        self.optimizer = make_optimizer(
+            device,
+            (self.sac.parameters(), sac["lr"]),
+            (self.metric.parameters(), encoder_lr),
+            (self.gmvae.parameters(), fit.pop("lr")),
+        )
         self.gmvae_loss = GMVAELoss(self.gmvae, **fit)
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
@@ -145,26 +155,12 @@ class ExploreStage(Stage):
         kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
         return kept.set("shown_action", shown)
 
-    def update(self) -> TensorDictBase:
-        batch = self.buffer.sample()  # ("next", "intrinsic_reward") appears here, from today's φ
-
-        sac = self.sac(batch)
-        gradient_step(self.sac_optimizer, sac["loss_actor"], sac["loss_qvalue"], sac["loss_alpha"])
-        self.sac_target.step()
-
-        metric = self.metric(batch)
-        gradient_step(
-            self.metric_optimizer,
-            *(value for key, value in metric.items() if key.startswith("loss_")),
-        )
-        if self.metric_target is not None:
-            self.metric_target.step()
-
-        gmvae = self.gmvae_loss(self._best(batch))
-        gradient_step(self.gmvae_optimizer, gmvae["loss_gmvae"])
-
-        bonus = batch["next", "intrinsic_reward"].mean()
-        return TensorDict({**sac, **metric, **gmvae, "intrinsic_reward": bonus}, [])
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        out = self.sac(batch)
+        out.update(self.metric(batch)).update(self.gmvae_loss(self._best(batch)))
+        loss = sum(value for key, value in out.items() if key.startswith("loss_"))
+        # ("next", "intrinsic_reward") appeared as the batch was drawn, from today's φ.
+        return loss, out.set("intrinsic_reward", batch["next", "intrinsic_reward"].mean())
 
     def _best(self, batch: TensorDictBase) -> TensorDictBase:
         """The better-rewarded share of a batch, as what the GMVAE sees."""
@@ -182,8 +178,8 @@ class ExploreStage(Stage):
         """
         for _ in range(self.final_updates):
             on_update()
-            loss = self.gmvae_loss(self._best(self.buffer.sample()))
-            gradient_step(self.gmvae_optimizer, loss["loss_gmvae"])
+            loss = self.gmvae_loss(self._best(self.buffer.sample()))["loss_gmvae"]
+            gradient_step(self.optimizer, loss)
         return SynergyDecoder.from_gmvae(self.gmvae, self.actions())
 
     def actions(self, count: int = 20_000) -> Tensor:
@@ -193,10 +189,8 @@ class ExploreStage(Stage):
     def parts(self) -> dict[str, Any]:
         return {
             "sac": self.sac,
-            "sac_optimizer": self.sac_optimizer,
             "metric": self.metric,
-            "metric_optimizer": self.metric_optimizer,
             "gmvae": self.gmvae,
-            "gmvae_optimizer": self.gmvae_optimizer,
+            "optimizer": self.optimizer,
             "bonus": self.bonus,
         }

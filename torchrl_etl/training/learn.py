@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.objectives import SoftUpdate
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
-from torchrl_etl.training.stage import Stage, entropy_target, gradient_step
-from torchrl_etl.transforms import SynergyAction
+from torchrl_etl.training.stage import Stage, entropy_target, make_optimizer, ready_for_training
 
 __all__ = ["LearnStage"]
 
@@ -31,7 +31,7 @@ class LearnStage(Stage):
     :class:`~torchrl_etl.objectives.DecoderLoss`.
 
     Args:
-        make_base_env (callable): seed → environment to which ETL's transforms are appended.
+        make_env (callable): environment to collect from.
         spec (EnvBase): any instance of that environment, to read sizes and bounds from.
         decoder (SynergyDecoder): from stage 1 or a bundle; it is trained in place.
 
@@ -47,7 +47,7 @@ class LearnStage(Stage):
 
     def __init__(
         self,
-        make_base_env: Callable[[int], TransformedEnv],
+        make_env: Callable[[], EnvBase],
         spec: EnvBase,
         decoder: SynergyDecoder,
         *,
@@ -62,19 +62,16 @@ class LearnStage(Stage):
         torch.manual_seed(stage["seed"])
         observation_dim = spec.observation_spec["observation"].shape[-1]
         self.decoder = decoder.to(device)
-        actor = make_actor(
+        self.actor = actor = make_actor(
             {"observation": observation_dim}, decoder.synergy_spec, out_key="synergy", **network
         ).to(device)
         critic = make_critic(
             {"observation": observation_dim, "action": decoder.action_dim}, **network
         ).to(device)
 
-        super().__init__(
-            lambda seed: make_base_env(seed).append_transform(SynergyAction(decoder)),
-            actor,
-            device=device,
-            **stage,
-        )
+        # The decoder acts as a part of the policy: its weights then reach every worker with the
+        # actor's. What it decodes is recorded as it happens.
+        super().__init__(make_env, TensorDictSequential(actor, decoder), device=device, **stage)
         self.sac = SynergySACLoss(
             actor,
             critic,
@@ -84,43 +81,33 @@ class LearnStage(Stage):
             target_entropy=entropy_target(decoder.synergy_spec, sac["action_std"]),
             alpha_init=sac["alpha_init"],
         ).to(device)
-        self.sac.make_value_estimator(gamma=sac["gamma"])
-        _ = self.sac.target_entropy  # created lazily; it must exist before the optimizer does
-        self.sac_target = SoftUpdate(self.sac, tau=sac["tau"])
+        self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
 
         self.decoder_loss = DecoderLoss(decoder)
         self.anchor = {"frozen": 0.0, "reconstruction": 1.0, "critic": anchor}[fine_tuning]
         tuned = [] if fine_tuning == "frozen" else list(decoder.parameters())
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": _without(self.sac.parameters(), decoder.parameters()), "lr": sac["lr"]},
-                {"params": tuned, "lr": decoder_lr},
-            ]
-        )
+        others = _without(self.sac.parameters(), decoder.parameters())
+        self.optimizer = make_optimizer(device, (others, sac["lr"]), (tuned, decoder_lr))
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
-        kept = batch.select("observation", "synergy", ("next", "observation"))
-        kept["action"] = batch["next", "executed_action"]  # logged when it happened: Eq. 10's pair
+        kept = batch.select("observation", "synergy", "action", ("next", "observation"))
         kept["next"].update(batch["next"].select("done", "terminated"))
         kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
         return kept
 
-    def update(self) -> TensorDictBase:
-        batch = self.buffer.sample()
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         sac = self.sac(batch)
-        losses = [sac["loss_actor"], sac["loss_qvalue"], sac["loss_alpha"]]
         reconstruction = self.decoder_loss(batch)["loss_decoder"]
+        loss = sac["loss_actor"] + sac["loss_qvalue"] + sac["loss_alpha"]
         if self.anchor:
-            losses.append(self.anchor * reconstruction)
-        gradient_step(self.optimizer, *losses)
-        self.sac_target.step()
-        return TensorDict({**sac, "loss_decoder": reconstruction}, [])
+            loss = loss + self.anchor * reconstruction
+        return loss, sac.set("loss_decoder", reconstruction)
 
     def parts(self) -> dict[str, Any]:
         return {
             "sac": self.sac,
             "optimizer": self.optimizer,
-            "actor": self.policy,
+            "actor": self.actor,
             "decoder": self.decoder,
         }
 

@@ -4,22 +4,42 @@ from __future__ import annotations
 
 import gc
 import math
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.optim import Adam, Optimizer
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
-from torchrl.collectors import Collector
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import (
+    Bounded,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    Storage,
+    TensorDictReplayBuffer,
+)
 from torchrl.envs import EnvBase
+from torchrl.objectives import SACLoss, SoftUpdate
 
+from torchrl_etl.collectors import Batches, make_batches
+from torchrl_etl.objectives import FusedSoftUpdate
 from torchrl_etl.training.buffer_adapter import BufferAdapter
+from torchrl_etl.training.compiled import compiled, cuda_graph
 
-__all__ = ["Progress", "Stage", "entropy_target", "gradient_step"]
+__all__ = [
+    "Progress",
+    "Stage",
+    "entropy_target",
+    "gradient_step",
+    "make_optimizer",
+    "ready_for_training",
+]
 
 
 class Progress:
@@ -42,7 +62,7 @@ class Stage(ABC):
     """One stage of ETL: collect a batch, keep it, update as often as its frames have earned.
 
     Args:
-        make_env (callable): seed → environment to collect from, transforms included.
+        make_env (callable): environment to collect from, transforms included.
         policy (TensorDictModuleBase): acts in it; its weights are shared with the losses.
 
     Keyword Args:
@@ -50,40 +70,59 @@ class Stage(ABC):
         seed (int): seed of the stage.
         device (torch.device): where networks and buffer live.
         buffer_size (int): transitions to keep; never more than the budget are allocated.
+        buffer_storage (str): "memory" keeps them on the device, "memmap" in files.
+        scratch (path): folder for these files, which are deleted when the stage is closed.
         batch_size (int): transitions in an update.
-        frames_per_batch (int): frames collected between updates, over all environments.
+        collector (mapping): arguments of :func:`~torchrl_etl.collectors.make_batches`.
         updates_per_frame (float): updates per collected frame.
         learning_starts (int): frames before the first update.
         reward_scale (float): factor on the task's reward as the buffer keeps it.
+        compile (bool): compile updates; on CUDA they also become one CUDA graph.
+            Default: ``False``.
     """
 
     name: str
+    optimizer: Adam
+    targets: Sequence[SoftUpdate]
 
     def __init__(
         self,
-        make_env: Callable[[int], EnvBase],
+        make_env: Callable[[], EnvBase],
         policy: TensorDictModuleBase,
         *,
+        collector: Mapping[str, Any],
         frames: int,
         seed: int,
         device: torch.device,
         buffer_size: int,
+        buffer_storage: Literal["memory", "memmap"],
+        scratch: Path,
         batch_size: int,
-        frames_per_batch: int,
         updates_per_frame: float,
         learning_starts: int,
         reward_scale: float,
+        compile: bool = False,
     ) -> None:
-        self.make_env, self.policy, self.seed, self.device = make_env, policy, seed, device
+        self.policy, self.seed, self.device = policy, seed, device
         self.reward_scale = reward_scale
-        self.budget, self.frames_per_batch = frames, frames_per_batch
+        self.budget = frames
+        self._make_batches = partial(
+            make_batches, **collector, make_env=make_env, policy=policy, device=device
+        )
         self.updates_per_frame, self.learning_starts = updates_per_frame, learning_starts
         self.progress = Progress()
         self.buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(min(buffer_size, frames + frames_per_batch), device=device),
+            storage=make_storage(
+                min(buffer_size, frames + collector["frames_per_batch"]),
+                device,
+                scratch / self.name if buffer_storage == "memmap" else None,
+            ),
             batch_size=batch_size,
         )
-        self.collector: Collector | None = None
+        self.batches: Batches | None = None
+        self._gradients = compiled(self.gradients) if compile else self.gradients
+        graphed = compile and device.type == "cuda"
+        self._step = cuda_graph(self.step) if graphed else self.step
 
     # What a stage defines -------------------------------------------------------------------
 
@@ -92,8 +131,8 @@ class Stage(ABC):
         """The entries of a flat batch that the buffer keeps."""
 
     @abstractmethod
-    def update(self) -> TensorDictBase:
-        """One gradient step on every part that this stage trains; returns scalars to log."""
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """What an update on this batch minimizes, all parts summed, and the scalars to log."""
 
     @abstractmethod
     def parts(self) -> dict[str, Any]:
@@ -110,27 +149,21 @@ class Stage(ABC):
         return self.frames >= self.budget
 
     def restart_collection(self) -> None:
-        """Build the environments anew, seeded by the frame count.
+        """Begin new episodes, seeded by the frame count.
 
         A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
-        self.close()
-        self.collector = Collector(
-            lambda: self.make_env(_mix(self.seed, self.frames)),
-            self.policy,
-            frames_per_batch=self.frames_per_batch,
-            total_frames=-1,
-            policy_device=self.device,
-            storing_device=self.device,
-            trust_policy=True,
-            auto_register_policy_transforms=False,
-        )
-        self._batches = iter(self.collector)
+        if self.batches is None:
+            # Only a run that begins or resumes builds a collector: that must not show.
+            random = GlobalRNGState().state_dict()
+            self.batches = self._make_batches(seed=_mix(self.seed, self.frames))
+            GlobalRNGState().load_state_dict(random)
+        self.batches.restart(_mix(self.seed, self.frames))
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
-        batch = next(self._batches).reshape(-1)
+        batch = self.batches.next().reshape(-1).to(self.device)
         self.buffer.extend(self.transitions(batch))
         self.progress.frames += batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
@@ -143,8 +176,30 @@ class Stage(ABC):
         due = int(self.progress.owed)
         self.progress.owed -= due
         self.progress.updates += due
-        logs = [self.update().detach() for _ in range(due)]
+        logs = [self.update() for _ in range(due)]
         return torch.stack(logs).mean(0) if logs else None
+
+    def update(self) -> TensorDictBase:
+        """One gradient step on every part that this stage trains; returns scalars to log."""
+        return self._step(self.buffer.sample().to(self.device))
+
+    def step(self, batch: TensorDictBase) -> TensorDictBase:
+        """An update on this batch."""
+        gradients, scalars = self._gradients(batch)
+        for parameter, gradient in zip(self._trained(), gradients, strict=True):
+            parameter.grad = gradient
+        self.optimizer.step()
+        for target in self.targets:
+            target.step()
+        return scalars
+
+    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+        """Gradients of what is trained, and the scalars to log."""
+        loss, scalars = self.losses(batch)
+        return torch.autograd.grad(loss, self._trained(), allow_unused=True), scalars.detach()
+
+    def _trained(self) -> list[Tensor]:
+        return [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
 
     def newest(self, count: int) -> TensorDictBase:
         """Up to ``count`` of the latest transitions, oldest first."""
@@ -159,12 +214,14 @@ class Stage(ABC):
         return checkpoint.register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:
-        if self.collector is not None:
-            self.collector.shutdown()
+        if self.batches is not None:
+            self.batches.close()
             # Simulators hold 100 MB each and sit in reference cycles: do not wait for the
             # garbage collector to come by.
-            self.collector = self._batches = None
+            self.batches = None
             gc.collect()
+        if isinstance(self.buffer.storage, LazyMemmapStorage):
+            shutil.rmtree(self.buffer.storage.scratch_dir, ignore_errors=True)
 
 
 def _mix(seed: int, frames: int) -> int:
@@ -193,8 +250,35 @@ def entropy_target(action_spec: Bounded, action_std: float | None) -> float | st
     return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())
 
 
-def gradient_step(optimizer: torch.optim.Optimizer, *losses: Tensor) -> None:
-    """One optimizer step on the sum of ``losses``."""
+def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
+    """Room for ``size`` transitions, taken when the first one comes; in files with ``scratch``."""
+    if scratch is None:
+        return LazyTensorStorage(size, device=device)
+    # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
+    return LazyMemmapStorage(size, scratch_dir=scratch, existsok=True)
+
+
+def ready_for_training(sac: SACLoss, *, gamma: float, tau: float) -> SoftUpdate:
+    """Give a SAC loss its discount factor and its target updater."""
+    sac.make_value_estimator(gamma=gamma)
+    _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
+    return FusedSoftUpdate(sac, tau=tau)
+
+
+def make_optimizer(device: torch.device, *groups: tuple[Iterable[Tensor], float]) -> Adam:
+    """Adam for several groups of parameters, each with its learning rate.
+
+    All groups take their step in one operation, which a CUDA graph can hold.
+    """
+    return Adam(
+        [{"params": list(parameters), "lr": lr} for parameters, lr in groups],
+        fused=True,
+        capturable=device.type == "cuda",
+    )
+
+
+def gradient_step(optimizer: Optimizer, loss: Tensor) -> None:
+    """One optimizer step on what this loss reaches."""
     optimizer.zero_grad(set_to_none=True)
-    sum(losses).backward()
+    loss.backward()
     optimizer.step()

@@ -57,7 +57,7 @@ def fit_gmvae(
         True
     """
     loss_module = GMVAELoss(gmvae)
-    optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr)
+    optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
     for _ in range(updates):
         on_update()
         chosen = actions[torch.randint(len(actions), (batch_size,), device=actions.device)]

@@ -130,14 +130,17 @@ class SynergyAction(ModuleTransform):
                 f"SynergyAction reads {self.synergy_key!r}, but the tensordict has only "
                 f"{sorted(map(str, tensordict.keys(True, True)))}; let the policy write it."
             )
-        decoder = self.module
-        with torch.no_grad():
-            entry = TensorDict({decoder.in_keys[0]: synergy}, synergy.shape[:-1])
-            action = decoder(entry).get(decoder.out_keys[0])
-        if self.parent is not None:
-            action = action.to(self._action_leaf.dtype)
+        action = self.decode(synergy)
         tensordict.set(self.action_key, action)
         return tensordict.set(self._decoded_key, action)
+
+    @torch.no_grad()
+    def decode(self, synergy: Tensor) -> Tensor:
+        """Actions [*, n] for coefficients [*, d], in the env's dtype."""
+        decoder = self.module
+        entry = TensorDict({decoder.in_keys[0]: synergy}, synergy.shape[:-1])
+        action = decoder(entry).get(decoder.out_keys[0])
+        return action if self.parent is None else action.to(self._action_leaf.dtype)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError(
@@ -153,27 +156,27 @@ class SynergyAction(ModuleTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return tensordict_reset.set(self.executed_key, self._rest(tensordict_reset))
+        return tensordict_reset.set(self.executed_key, self.rest(tensordict_reset.batch_size))
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Here nobody merges by the reset mask for us.
-        rest = self._rest(tensordict_reset)
+        rest = self.rest(tensordict_reset.batch_size)
         reset = tensordict.get(self.parent.reset_keys[0]).reshape(tensordict.batch_size)
         present = tensordict.get(self.executed_key)
         return tensordict_reset.set(
             self.executed_key, torch.where(expand_as_right(reset, rest), rest, present)
         )
 
-    def _rest(self, tensordict: TensorDictBase) -> Tensor:
+    def rest(self, batch_size: torch.Size) -> Tensor:
         """What counts as executed before the first step: zeros brought into the bounds."""
         leaf = self._action_leaf
         rest = leaf.zero()
         if isinstance(leaf, Bounded):
             rest = rest.clamp(leaf.space.low, leaf.space.high)
         # An env that is not batch-locked leaves the batch size to the data.
-        return rest.expand(*tensordict.batch_size, *rest.shape[self.parent.ndim :]).clone()
+        return rest.expand(*batch_size, *rest.shape[self.parent.ndim :]).clone()
 
     @property
     def _action_leaf(self) -> TensorSpec:

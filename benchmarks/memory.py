@@ -1,0 +1,87 @@
+"""Resident memory of a run with a million transitions in a memory-mapped buffer.
+
+    python benchmarks/memory.py
+    python benchmarks/memory.py --env myoLegWalk --transitions 1000000
+
+The buffer of stage 2 is filled with copies of one collected batch, since collecting a million
+frames takes an hour; then the run goes on collecting in its worker and learning. Memory is that of
+the learner and all of its workers: what only they have (``private``: anonymous and shared memory)
+and what the operating system keeps of the buffer's file and may drop at any time (``file``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness import line
+from hydra import compose, initialize_config_dir
+
+from torchrl_etl.command_line import quiet_torchrl
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.training import Experiment
+
+CONF = Path(__file__).parent.parent / "recipes" / "conf"
+
+
+def resident_gigabytes() -> dict[str, float]:
+    """By kind, over this process and its children (Linux); shared pages are divided among them."""
+    processes = [os.getpid(), *(child.pid for child in multiprocessing.active_children())]
+    total = {"private": 0, "file": 0}
+    for process in processes:
+        for row in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()[1:]:
+            name, kilobytes = row.split()[:2]
+            if name in ("Pss_Anon:", "Pss_Shmem:"):
+                total["private"] += int(kilobytes)
+            elif name == "Pss_File:":
+                total["file"] += int(kilobytes)
+    return {name: kilobytes / 1e6 for name, kilobytes in total.items()}
+
+
+def measure(arguments: argparse.Namespace, folder: str) -> None:
+    overrides = [
+        f"env={arguments.env}",
+        f"run_dir='{folder}'",
+        "collector=process",
+        f"learn.buffer_storage={arguments.storage}",
+        f"learn.frames={arguments.transitions}",
+    ]
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        experiment = Experiment(compose("config", overrides=overrides))
+    space = experiment.spec.full_action_spec_unbatched["action"].space
+    decoder = SynergyDecoder(4, len(experiment.actuators), low=space.low, high=space.high)
+    stage = experiment.learn_stage(decoder)
+    stage.restart_collection()
+    rows = stage.transitions(stage.collect())
+    copies = rows.expand(100, *rows.shape).reshape(-1)
+    while len(stage.buffer) < arguments.transitions:
+        stage.buffer.extend(copies)
+    for _ in range(arguments.batches):
+        stage.collect()
+        stage.learn()
+    for name, gigabytes in resident_gigabytes().items():
+        case = f"{arguments.env}/{arguments.storage}/{name}"
+        line("memory", case, "GB", [gigabytes], transitions=len(stage.buffer))
+    per_row = sum(value[0].numel() * value.element_size() for value in rows.values(True, True))
+    line("memory", f"{arguments.env}/{arguments.storage}/transition", "kB", [per_row / 1e3])
+    stage.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="myoLegWalk")
+    parser.add_argument("--transitions", type=int, default=1_000_000)
+    parser.add_argument("--storage", default="memmap", choices=("memory", "memmap"))
+    parser.add_argument("--batches", type=int, default=20, help="to go on for, when it is full")
+    parser.add_argument("--folder", default=".", help="on a disk, for the buffer's files")
+    arguments = parser.parse_args()
+    quiet_torchrl()
+    with TemporaryDirectory(dir=arguments.folder) as folder:
+        measure(arguments, folder)
+
+
+if __name__ == "__main__":
+    main()

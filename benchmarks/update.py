@@ -1,0 +1,283 @@
+"""Milliseconds an update: ours, TorchRL's own recipe, Stable-Baselines3, and the products alone.
+
+    python benchmarks/update.py
+    make peers && python benchmarks/update.py --compile --repeats 15
+
+One thread and CPU time, so that other processes disturb little; the cases take turns in blocks of
+updates. ``floor`` is what ``torch.mm`` takes for exactly the products of an update, each on tensors
+of its own, without a gradient where none is needed. Random transitions of one task's sizes stand in
+for a buffer: the cost of an update does not depend on what they hold.
+
+``sac`` is SAC on raw actions, the same nets for all three libraries; ``explore`` and ``learn`` are
+the whole updates of both stages. A ratio is to the floor, but to ours for TorchRL and its peer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is there
+
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import interleave, line
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_etl.command_line import quiet_torchrl
+from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.objectives import LeanSACLoss
+from torchrl_etl.training import Experiment
+from torchrl_etl.training.stage import Stage, make_optimizer, ready_for_training
+
+ROOT = Path(__file__).parent.parent
+PEER = ROOT / ".venv-peers" / "bin" / "python"
+TRANSITIONS = 4096
+CPU = torch.device("cpu")
+Shape = tuple[int, int, int]
+
+
+def config(env: str, compiled: bool, layer_norm: bool) -> Any:
+    overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compiled).lower()}"]
+    overrides += [f"network.layer_norm={str(layer_norm).lower()}"]
+    with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
+        return compose("config", overrides=overrides)
+
+
+def stages(env: str, compiled: bool, layer_norm: bool) -> tuple[Stage, Stage]:
+    """Both stages as the recipe builds them, their buffers filled."""
+    experiment = Experiment(config(env, compiled, layer_norm))
+    space = experiment.spec.full_action_spec_unbatched["action"].space
+    decoder = SynergyDecoder(
+        experiment.config.num_synergies,
+        len(experiment.actuators),
+        low=space.low.tolist(),
+        high=space.high.tolist(),
+    )
+    both = experiment.explore_stage(), experiment.learn_stage(decoder)
+    sizes = experiment.spec.observation_spec["observation"].shape[-1], decoder.action_dim
+    for stage in both:
+        stage.buffer.extend(transitions(*sizes, decoder.num_synergies))
+    return both
+
+
+def transitions(observation_dim: int, action_dim: int, num_synergies: int) -> TensorDict:
+    """Every entry that some update reads."""
+    direction = torch.nn.functional.normalize(torch.randn(TRANSITIONS, num_synergies), dim=-1)
+    flags = torch.zeros(TRANSITIONS, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.randn(TRANSITIONS, observation_dim),
+            "direction": direction,
+            "action": torch.rand(TRANSITIONS, action_dim),
+            "shown_action": torch.rand(TRANSITIONS, action_dim),
+            "synergy": 2 * torch.rand(TRANSITIONS, num_synergies) - 1,
+            "next": {
+                "observation": torch.randn(TRANSITIONS, observation_dim),
+                "direction": direction,
+                "reward": 0.1 * torch.randn(TRANSITIONS, 1),
+                "done": flags,
+                "terminated": flags.clone(),
+            },
+        },
+        [TRANSITIONS],
+    )
+
+
+# The floor ------------------------------------------------------------------------------------
+
+
+def products(batch: int, widths: list[int], passes: str) -> Iterator[Shape]:
+    """Products of a perceptron's passes.
+
+    ``f``: forward; ``w``: gradient of its weights; ``h``: of its hidden layers, on the way there;
+    ``i``: of its input.
+    """
+    layers = list(pairwise(widths))
+    for kind in passes:
+        for index, (wide, narrow) in enumerate(layers):
+            if kind == "f":
+                yield batch, wide, narrow
+            elif kind == "w":
+                yield wide, batch, narrow
+            elif kind == "i" or index:
+                yield batch, narrow, wide
+
+
+def sac_products(batch: int, inputs: int, action: int, out: int, hidden: list[int]) -> list[Shape]:
+    """Twin critics on ``inputs`` + ``action``, an actor that emits ``out``."""
+    critic = [inputs + action, *hidden, 1]
+    shapes = list(products(batch, [inputs, *hidden, 2 * out], "ffwh"))
+    for _ in range(2):
+        shapes += products(batch, critic, "ffwhfh")  # target, regression, under the actor
+        shapes.append((batch, hidden[0], action))  # and its gradient at the action alone
+    return shapes
+
+
+def stage_products(cfg: Any, name: str, observation_dim: int, action_dim: int) -> list[Shape]:
+    d, batch, hidden = cfg.num_synergies, cfg[name].batch_size, list(cfg.network.hidden)
+    body = list(cfg.explore.gmvae.hidden)
+    decoder = [d, *reversed(body), action_dim]
+    if name == "learn":
+        shapes = sac_products(batch, observation_dim, action_dim, d, hidden)
+        return shapes + list(products(batch, decoder, "ffwifwh"))  # s', s, Eq. 10
+    shapes = sac_products(batch, observation_dim + d, action_dim, action_dim, hidden)
+    shapes += products(batch, [observation_dim, *cfg.explore.encoder.hidden, d], "fwhff")
+    shapes += products(batch, [action_dim, *body, d * (1 + 2 * d)], "fwh")
+    return shapes + list(products(d * batch, decoder, "fwi"))
+
+
+def floor(shapes: list[Shape]) -> Callable[[], object]:
+    operands = [
+        (torch.randn(rows, inner), torch.randn(inner, columns), torch.empty(rows, columns))
+        for rows, inner, columns in shapes
+    ]
+
+    def run() -> None:
+        for left, right, out in operands:
+            torch.mm(left, right, out=out)
+
+    return run
+
+
+# Plain SAC ------------------------------------------------------------------------------------
+
+
+def plain_sac(cfg: Any, stage: Stage, lean: bool) -> Callable[[], object]:
+    """SAC on raw actions: with our loss as our stages use it, or as TorchRL's recipe does."""
+    example = stage.buffer.storage[:2]
+    sizes = {key: example[key].shape[-1] for key in ("observation", "action")}
+    spec = Bounded(-1, 1, shape=(sizes["action"],))
+    network = {"hidden": list(cfg.network.hidden), "layer_norm": cfg.network.layer_norm}
+    actor = make_actor({"observation": sizes["observation"]}, spec, **network)
+    loss = (LeanSACLoss if lean else SACLoss)(
+        actor, make_critic(sizes, **network), action_spec=spec
+    )
+    if lean:
+        target = ready_for_training(loss, gamma=0.99, tau=0.005)
+        optimizer = make_optimizer(CPU, (loss.parameters(), 3e-4))
+    else:
+        loss.make_value_estimator(gamma=0.99)
+        target = SoftUpdate(loss, tau=0.005)
+        _ = loss.target_entropy
+        optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(TRANSITIONS), batch_size=cfg.learn.batch_size
+    )
+    keys = ("observation", "action", "next")
+    buffer.extend(stage.buffer.storage[:].select(*keys))
+
+    def run() -> None:
+        out = loss(buffer.sample())
+        optimizer.zero_grad()
+        (out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]).backward()
+        optimizer.step()
+        target.step()
+
+    return run
+
+
+class Peer:
+    """Stable-Baselines3 in its own process and environment."""
+
+    def __init__(self, case: dict[str, Any]) -> None:
+        self.process = subprocess.Popen(
+            [PEER, ROOT / "benchmarks" / "peer_sb3.py", json.dumps(case)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        self.versions = json.loads(self.process.stdout.readline())
+
+    def block(self, updates: int) -> float:
+        self.process.stdin.write(f"{updates}\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())["ms"]
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":")[1].strip() for line in lines if "model name" in line), "")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="myoHandPenTwirl")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--block", type=int, default=20, help="updates measured at a time")
+    parser.add_argument("--compile", action="store_true", help="also with compile=true")
+    parser.add_argument("--no-layer-norm", dest="layer_norm", action="store_false")
+    arguments = parser.parse_args()
+    quiet_torchrl()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+    cfg = config(arguments.env, False, arguments.layer_norm)
+    explore, learn = stages(arguments.env, False, arguments.layer_norm)
+    example = learn.buffer.storage[:2]
+    sizes = example["observation"].shape[-1], example["action"].shape[-1]
+    batch, hidden = cfg.learn.batch_size, list(cfg.network.hidden)
+
+    def timed(update: Callable[[], object]) -> Callable[[], float]:
+        def block() -> float:
+            start = time.process_time()
+            for _ in range(arguments.block):
+                update()
+            return 1e3 * (time.process_time() - start) / arguments.block
+
+        return block
+
+    cases = {
+        "floor/sac": timed(floor(sac_products(batch, *sizes, sizes[1], hidden))),
+        "floor/explore": timed(floor(stage_products(cfg, "explore", *sizes))),
+        "floor/learn": timed(floor(stage_products(cfg, "learn", *sizes))),
+        "ours/sac": timed(plain_sac(cfg, learn, lean=True)),
+        "ours/explore": timed(explore.update),
+        "ours/learn": timed(learn.update),
+        "torchrl/sac": timed(plain_sac(cfg, learn, lean=False)),
+    }
+    more: dict[str, Any] = {"cpu": cpu_model(), "layer_norm": arguments.layer_norm}
+    if arguments.compile:
+        for stage in stages(arguments.env, True, arguments.layer_norm):
+            start = time.perf_counter()
+            stage.update(), stage.update()
+            more[f"compile_{stage.name}_seconds"] = round(time.perf_counter() - start, 1)
+            cases[f"compiled/{stage.name}"] = timed(stage.update)
+    peer = None
+    if PEER.exists():
+        case = {"observation_dim": sizes[0], "action_dim": sizes[1], "hidden": hidden}
+        case |= {"batch_size": batch, "transitions": TRANSITIONS}
+        peer = Peer(case | {"layer_norm": arguments.layer_norm})
+        more |= {"peer_versions": peer.versions}
+        cases["stable_baselines3/sac"] = lambda: peer.block(arguments.block)
+
+    values = interleave(cases, arguments.repeats)
+    if peer is not None:
+        peer.close()
+    for name, each in values.items():
+        library, part = name.split("/")
+        other = "ours/sac" if library in ("torchrl", "stable_baselines3") else f"floor/{part}"
+        line("update", name, "ms", each, peer=other, peer_values=values[other], **more)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""A small policy that acts through a decoder, and what it means that a batch is fresh."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+
+from torchrl_etl.envs import make_env
+from torchrl_etl.modules import SynergyDecoder, make_actor
+
+make_batched_env = partial(make_env, "overactuated", num_envs=2)
+
+
+def synergy_policy() -> TensorDictSequential:
+    """observation [6] → synergy [2] → action [16], for ``make_batched_env``."""
+    torch.manual_seed(0)
+    decoder = SynergyDecoder(2, 16, hidden=(8,))
+    actor = make_actor({"observation": 6}, decoder.synergy_spec, out_key="synergy", hidden=(8,))
+    return TensorDictSequential(actor, decoder)
+
+
+def decode_to(policy: TensorDictSequential, value: float) -> torch.Tensor:
+    """From now on every action of the policy is one constant, which is returned."""
+    _make_constant(policy[1], value)
+    with torch.no_grad():
+        return policy[1](TensorDict({"synergy": torch.zeros(2)}))["action"][0]
+
+
+def act_around(policy: TensorDictSequential, value: float) -> None:
+    """From now on the actor writes this number as ``loc``."""
+    _make_constant(policy[0], value)
+
+
+def _make_constant(module: torch.nn.Module, value: float) -> None:
+    last = [layer for layer in module.modules() if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(value)
+
+
+def was_decoded_by(batch: TensorDictBase, policy: TensorDictSequential) -> bool:
+    with torch.no_grad():
+        decoded = policy[1](batch.select("synergy").clone())["action"]
+    return torch.allclose(batch["action"], decoded, atol=1e-6)
+
+
+def distinct_frames(batches: list[TensorDictBase]) -> int:
+    """Noise makes no two frames equal, unless one was delivered twice."""
+    frames = torch.cat([batch.reshape(-1) for batch in batches])
+    return len(torch.cat([frames["observation"], frames["synergy"]], -1).unique(dim=0))
+
+
+def origin(batch: TensorDictBase, key: str) -> int:
+    (value,) = batch["collector", key].unique().tolist()
+    return value

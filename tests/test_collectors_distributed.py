@@ -1,0 +1,165 @@
+"""Collector workers in a torch.distributed group: fresh weights, faults, seeds."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+import torch
+
+from tests.synergy_policy import (
+    act_around,
+    decode_to,
+    distinct_frames,
+    make_batched_env,
+    origin,
+    synergy_policy,
+    was_decoded_by,
+)
+from torchrl_etl.collectors import VectorCollector
+from torchrl_etl.collectors.distributed import DistributedWorkers
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("distributed")]
+
+
+@pytest.fixture
+def start():
+    """Starts workers; they are ended with the test."""
+    started = []
+
+    def build(env=make_batched_env, **kwargs) -> tuple[DistributedWorkers, torch.nn.Module]:
+        policy = synergy_policy()
+        kwargs = {"num_workers": 2, "frames_per_batch": 16, "timeout": 60.0, **kwargs}
+        started.append(DistributedWorkers(env, policy, **kwargs))
+        return started[-1], policy
+
+    yield build
+    for collector in started:
+        collector.shutdown()
+    assert not multiprocessing.active_children()
+
+
+def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(start):
+    collector, policy = start(sync=True, collector_class=VectorCollector)
+    batches = iter(collector)
+    batch = next(batches)
+    assert batch.shape == (2, 2, 4)  # workers, environments, time
+    assert was_decoded_by(batch, policy)
+    first, second = batch["observation"][:, :, 0]
+    assert not torch.isclose(first[:, :2], second[:, :2]).any()  # episodes begin elsewhere ...
+    noise = (batch["synergy"][:, :, 0].atanh() - batch["loc"][:, :, 0]) / batch["scale"][:, :, 0]
+    assert not torch.isclose(noise[0], noise[1], atol=1e-3).any()  # ... and explore otherwise
+
+    for version in (1, 2):
+        action = decode_to(policy, 0.3 * version)
+        act_around(policy, version)
+        collector.update_policy_weights_()
+        batch = next(batches)
+        assert torch.allclose(batch["action"], action.expand_as(batch["action"]))
+        assert was_decoded_by(batch, policy)
+        assert (batch["loc"] == version).all()
+        assert origin(batch, "policy_version") == version
+
+
+def test_asynchronous_workers_take_turns_and_only_batches_under_way_have_older_weights(start):
+    collector, policy = start(sync=False)
+    batches = iter(collector)
+    seen = [next(batches)]
+    action = decode_to(policy, 0.5)
+    collector.update_policy_weights_()
+    versions = {0: [], 1: []}
+    for _ in range(40):
+        seen.append(batch := next(batches))
+        version = origin(batch, "policy_version")
+        versions[origin(batch, "worker")].append(version)
+        assert (version == 1) == torch.allclose(batch["action"], action.expand_as(batch["action"]))
+    for of_worker in versions.values():
+        assert len(of_worker) > 10
+        assert set(of_worker[1:]) == {1}
+    frames = sum(batch.numel() for batch in seen)
+    assert collector.collected_frames == frames == distinct_frames(seen)
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_a_killed_worker_ends_the_run_with_a_message_that_names_it(start, sync):
+    collector, _ = start(sync=sync)
+    batches = iter(collector)
+    next(batches)
+    os.kill(collector.jobs[1].pid, signal.SIGKILL)
+    began = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"worker 1 .*resume=FOLDER"):
+        for _ in range(10_000):
+            next(batches)
+    assert time.monotonic() - began < 20
+    began = time.monotonic()
+    collector.shutdown()
+    assert time.monotonic() - began < 1
+
+
+def test_a_worker_that_does_not_answer_ends_the_run_too(start):
+    collector, _ = start(sync=False)
+    batches = iter(collector)
+    next(batches)
+    collector.timeout = 3.0
+    os.kill(collector.jobs[0].pid, signal.SIGSTOP)
+    with pytest.raises(RuntimeError, match="worker 0 gave no batch in 3 s"):
+        for _ in range(10_000):
+            next(batches)
+
+
+def test_a_worker_that_stops_before_a_push_ends_the_run_too(start):
+    collector, _ = start(sync=True, timeout=30.0)
+    batches = iter(collector)
+    next(batches)
+    collector.update_policy_weights_()
+    os.kill(collector.jobs[0].pid, signal.SIGSTOP)
+    began = time.monotonic()
+    with pytest.raises(RuntimeError, match="worker 0 did not take weights"):
+        next(batches)
+    assert time.monotonic() - began < 45
+
+
+def test_a_worker_that_cannot_start_is_reported_in_time(start):
+    learner = os.getpid()
+
+    def broken_elsewhere():
+        if os.getpid() != learner:
+            os._exit(1)
+        return make_batched_env()
+
+    began = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"ended while it started|did not start"):
+        start(broken_elsewhere, timeout=10.0)
+    assert time.monotonic() - began < 40
+
+
+def test_workers_end_at_once_and_the_group_is_gone(start):
+    collector, _ = start(total_frames=48)
+    assert sum(batch.numel() for batch in collector) == collector.collected_frames == 48
+    began = time.monotonic()
+    collector.shutdown()
+    collector.shutdown()
+    assert time.monotonic() - began < 10
+    assert not torch.distributed.is_initialized()
+    with pytest.raises(RuntimeError, match="pass seed=3 to the constructor"):
+        collector.set_seed(3)
+
+
+def test_bad_arguments_are_named_before_anything_is_started():
+    policy = synergy_policy()
+    with pytest.raises(ValueError, match="launcher must be 'mp' or 'submitit', got 'slurm'"):
+        DistributedWorkers(
+            make_batched_env, policy, num_workers=1, frames_per_batch=8, launcher="slurm"
+        )
+    with pytest.raises(ValueError, match="num_workers must be a positive integer"):
+        DistributedWorkers(make_batched_env, policy, num_workers=0, frames_per_batch=8)
+    with pytest.raises(OSError, match="no such model"):  # its own error, not a worker's silence
+
+        def broken():
+            raise OSError("no such model")
+
+        DistributedWorkers(broken, policy, num_workers=1, frames_per_batch=8)
+    assert not multiprocessing.active_children()

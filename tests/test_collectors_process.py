@@ -1,0 +1,214 @@
+"""Workers in processes: fresh weights, the same frames, faults that end in words."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import gymnasium
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import RewardSum, TransformedEnv
+
+from tests.point_env import PointTask
+from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
+from torchrl_etl.envs import make_env
+from torchrl_etl.modules import SynergyDecoder, make_actor
+
+FRAMES = 48
+
+
+def make_overactuated() -> TransformedEnv:
+    return TransformedEnv(make_env("overactuated", num_envs=4), RewardSum())
+
+
+@pytest.fixture
+def policy() -> TensorDictSequential:
+    torch.manual_seed(0)
+    decoder = SynergyDecoder(2, 16, hidden=(16,))
+    actor = make_actor({"observation": 6}, decoder.synergy_spec, out_key="synergy", hidden=(32, 32))
+    return TensorDictSequential(actor, decoder)
+
+
+def decodes_to(policy: TensorDictSequential, value: float) -> None:
+    """Lets the decoder give one action for any synergy."""
+    with torch.no_grad():
+        last = policy.module[1].module.decoder.mlp[-1]
+        last.weight.zero_()
+        last.bias.fill_(torch.atanh(torch.tensor(value)))
+
+
+@pytest.fixture
+def start(policy):
+    """Starts batches of a kind, and closes what was started."""
+    started = []
+
+    def start(kind: str, make=make_overactuated, **kwargs):
+        kwargs = {"frames_per_batch": FRAMES, "timeout": 60.0, **kwargs}
+        batches = make_batches(kind, make, policy, **kwargs)
+        started.append(batches)
+        return batches
+
+    yield start
+    for batches in started:
+        batches.close()
+        batches.close()  # again does nothing
+
+
+def observations(batches, count: int = 3) -> torch.Tensor:
+    return torch.stack([batches.next().reshape(-1)["next", "observation"] for _ in range(count)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [False, True])
+def test_a_process_collects_what_this_one_would(start, ahead):
+    here, there = start("single"), start("process", ahead=ahead)
+    for batches in (here, there):
+        batches.restart(seed=5)
+    first = observations(here)
+    assert torch.equal(first, observations(there))
+    for batches in (here, there):  # whatever was under way does not show
+        batches.restart(seed=5)
+    assert torch.equal(first, observations(here))
+    assert torch.equal(first, observations(there))
+
+
+@pytest.mark.slow
+def test_the_next_batch_that_is_asked_for_decodes_with_the_newest_decoder(start, policy):
+    in_turns, ahead = start("process"), start("process", ahead=True)
+    for batches in (in_turns, ahead):
+        batches.restart(seed=0)
+        batches.next()
+    decodes_to(policy, 0.5)
+    assert in_turns.next()["action"].allclose(torch.tensor(0.5))
+    under_way, next_one = ahead.next(), ahead.next()
+    assert under_way["action"].std() > 0  # asked for before the change
+    assert next_one["action"].allclose(torch.tensor(0.5))
+
+
+@pytest.mark.slow
+def test_an_optimizer_step_does_not_reach_a_rollout_unasked(start, policy):
+    batches = start("process", ahead=True)
+    batches.restart(seed=1)
+    observations(batches, 1)
+    decodes_to(policy, -0.5)  # while a batch is under way
+    changed = batches.next()["action"].eq(-0.5)
+    assert not changed.any()
+
+
+@pytest.mark.slow
+def test_async_workers_take_new_weights(start, policy):
+    batches = start("async", num_workers=2)
+    batches.next()
+    decodes_to(policy, 0.25)
+    for _ in range(6):  # at most one finished and one begun batch of each worker are older
+        batch = batches.next()
+    assert batch["action"].allclose(torch.tensor(0.25))
+    assert batch.shape == (4, FRAMES // 4)
+
+
+@pytest.mark.slow
+def test_workers_do_not_repeat_each_other(start):
+    batches = start("process", num_workers=2, frames_per_batch=2 * FRAMES)
+    batches.restart(seed=2)
+    first, second = batches.next()
+    assert not torch.equal(first["synergy"], second["synergy"])
+    assert not torch.equal(first["observation"], second["observation"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["process", "async"])
+def test_a_killed_worker_ends_in_a_message_soon(start, kind):
+    batches = start(kind, num_workers=2, frames_per_batch=2 * FRAMES)
+    batches.next()
+    os.kill(batches._collector.procs[1].pid, signal.SIGKILL)
+    begun = time.monotonic()
+    with pytest.raises(CollectionError, match=r"worker 1 .*\(?exit code -9\).*resume=FOLDER"):
+        for _ in range(4):
+            batches.next()
+    batches.close()
+    assert time.monotonic() - begun < 30
+
+
+class Stuck(PointTask):
+    def step(self, action):
+        if self.episode > 1 and self.age == 2:  # not while it is being built
+            time.sleep(3600)
+        return super().step(action)
+
+
+def make_stuck() -> TransformedEnv:
+    gymnasium.register("torchrl_etl_tests/Stuck-v0", entry_point=Stuck)
+    return TransformedEnv(make_env("torchrl_etl_tests/Stuck-v0", num_envs=4), RewardSum())
+
+
+@pytest.mark.slow
+def test_a_hanging_worker_is_not_waited_for_without_end():
+    actor = make_actor({"observation": 3}, PointTaskSpec, hidden=(8,))
+    batches = make_batches("process", make_stuck, actor, frames_per_batch=8)
+    batches._timeout = 3.0
+    with pytest.raises(CollectionError, match=r"did not give a batch within 3 s.*timeout"):
+        for _ in range(4):
+            batches.next()
+    processes = batches._collector.procs
+    batches.close()
+    for process in processes:
+        process.join(10)
+        assert not process.is_alive()
+
+
+PointTaskSpec = make_env("overactuated").full_action_spec_unbatched["action"][..., :5]
+
+LEARNER = """
+import time
+from tests.test_collectors_process import *
+if __name__ == "__main__":
+    decoder = SynergyDecoder(2, 16, hidden=(16,))
+    actor = make_actor({"observation": 6}, decoder.synergy_spec, out_key="synergy", hidden=(8,))
+    policy = TensorDictSequential(actor, decoder)
+    batches = make_batches("process", make_overactuated, policy, frames_per_batch=48, ahead=True)
+    batches.next()
+    print(batches._collector.procs[0].pid, flush=True)
+    time.sleep(3600)
+"""
+
+
+@pytest.mark.slow
+def test_workers_of_a_killed_learner_end_too(tmp_path):
+    script = tmp_path / "learner.py"
+    script.write_text(LEARNER)
+    learner = subprocess.Popen(
+        [sys.executable, script],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+    )
+    worker = int(learner.stdout.readline())
+    learner.kill()
+    learner.wait()
+    for _ in range(200):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        with open(f"/proc/{worker}/stat") as stat:
+            if stat.read().rsplit(")", 1)[1].split()[0] == "Z":
+                return
+        time.sleep(0.1)
+    pytest.fail("the worker lives on")
+
+
+def test_single_cannot_run_ahead():
+    with pytest.raises(ValueError, match="takes a second process"):
+        from torchrl_etl.collectors import Batches
+
+        Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)
+
+
+def test_an_unknown_kind_is_named(policy):
+    with pytest.raises(ValueError, match="kind is 'proces'; choose one of single, process"):
+        make_batches("proces", make_overactuated, policy, frames_per_batch=FRAMES)

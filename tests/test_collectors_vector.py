@@ -1,0 +1,196 @@
+"""The fast collector against TorchRL's own, transition by transition."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import (
+    ExplorationType,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    set_exploration_type,
+)
+
+from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
+from torchrl_etl.collectors import VectorCollector
+from torchrl_etl.envs import make_env
+from torchrl_etl.modules import SynergyDecoder, make_actor
+from torchrl_etl.transforms import DirectionPrimer, SynergyAction
+
+PLAIN = {"trust_policy": True, "auto_register_policy_transforms": False}
+
+
+def parts(name: str, mode: str, num_envs: int = 3, **kwargs):
+    """A maker of the environment of a stage, and a policy for it."""
+    make = partial(make_env, name, num_envs=num_envs, **kwargs)
+    env = make()
+    spec = env.full_action_spec_unbatched["action"]
+    observation = {"observation": env.observation_spec["observation"].shape[-1]}
+    env.close()
+    torch.manual_seed(0)
+    if mode == "explore":
+        actor = make_actor({**observation, "direction": 4}, spec, hidden=(32, 32))
+        return lambda: TransformedEnv(make(), RewardSum()).append_transform(
+            DirectionPrimer(4)
+        ), actor
+    num_synergies = min(2, spec.shape[0])
+    decoder = SynergyDecoder(
+        num_synergies, spec.shape[0], low=spec.space.low, high=spec.space.high, hidden=(16,)
+    )
+    with torch.no_grad():
+        decoder.module.scale.fill_(5.0)  # so that actions differ
+    actor = make_actor(observation, decoder.synergy_spec, out_key="synergy", hidden=(32, 32))
+    if mode == "policy":
+        return lambda: TransformedEnv(make(), RewardSum()), TensorDictSequential(actor, decoder)
+    return lambda: TransformedEnv(make(), RewardSum()).append_transform(
+        SynergyAction(decoder)
+    ), actor
+
+
+def batches(collector_class, make, policy, count: int = 3, frames: int = 96, **kwargs):
+    collector = collector_class(make, policy, frames_per_batch=frames, total_frames=-1, **kwargs)
+    collector.set_seed(7)
+    torch.manual_seed(7)
+    collector.reset()
+    iterator = iter(collector)
+    found = [next(iterator).clone() for _ in range(count)]
+    collector.shutdown()
+    return found
+
+
+def assert_same(ours, theirs) -> None:
+    for mine, other in zip(ours, theirs, strict=True):
+        assert mine.batch_size == other.batch_size and mine.names == other.names
+        assert set(mine.keys(True, True)) == set(other.keys(True, True))
+        for key in other.keys(True, True):
+            assert mine[key].dtype == other[key].dtype, key
+            assert torch.equal(mine[key], other[key]), key
+
+
+@pytest.mark.parametrize("mode", ["explore", "policy", "transform"])
+@pytest.mark.parametrize("name", ["overactuated", "InvertedPendulum-v5"])
+def test_transitions_are_bit_by_bit_those_of_torchrl(name, mode):
+    make, policy = parts(name, mode)
+    ours = batches(VectorCollector, make, policy)
+    theirs = batches(Collector, make, policy, **PLAIN)
+    assert_same(ours, theirs)
+    ended = "terminated" if name == "InvertedPendulum-v5" else "truncated"
+    assert sum(batch["next", ended].sum() for batch in ours) > 2
+    if name == "overactuated":
+        assert not any(batch["next", "terminated"].any() for batch in ours)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["myoHandPenTwirl", "dog-run"])
+def test_real_simulators_too(name):
+    make, policy = parts(name, "explore", num_envs=2)
+    assert_same(
+        batches(VectorCollector, make, policy, frames=120),
+        batches(Collector, make, policy, frames=120, **PLAIN),
+    )
+
+
+def test_resets_of_single_environments_keep_the_others():
+    def make():
+        return TransformedEnv(vectorized_point(), RewardSum())
+
+    policy = TensorDictModule(
+        nn.Linear(OBSERVATION_DIM, ACTION_DIM), in_keys=["observation"], out_keys=["action"]
+    )
+    ours = batches(VectorCollector, make, policy, frames=24)
+    assert_same(ours, batches(Collector, make, policy, frames=24, **PLAIN))
+    assert ours[0]["next", "done"].sum(1).flatten().tolist() == [4, 2, 2]  # of 2, 3, 4 steps
+
+
+def test_a_policy_that_is_not_a_plain_sequence_is_called_as_it_is():
+    class Doubled(TensorDictModule):
+        def forward(self, tensordict):
+            out = super().forward(tensordict)
+            return out.set("action", out["action"].clamp(-0.5, 0.5))
+
+    make, _ = parts("overactuated", "policy")
+    policy = Doubled(nn.Linear(6, 16), in_keys=["observation"], out_keys=["action"])
+    ours = batches(VectorCollector, make, policy)
+    assert_same(ours, batches(Collector, make, policy, **PLAIN))
+    assert ours[0]["action"].abs().max() <= 0.5
+
+
+def test_collection_depends_on_nothing_else_in_the_process_and_disturbs_nothing():
+    make, policy = parts("overactuated", "explore")
+    collector = VectorCollector(make, policy, frames_per_batch=96, total_frames=-1)
+    iterator = iter(collector)
+
+    def collected(disturbance: int):
+        collector.set_seed(3)
+        collector.reset()
+        out = []
+        for _ in range(2):
+            torch.manual_seed(disturbance)
+            before = torch.get_rng_state()
+            out.append(next(iterator).clone())
+            assert torch.equal(torch.get_rng_state(), before)
+        return torch.stack(out).exclude(("collector", "traj_ids"))
+
+    assert (collected(1) == collected(2)).all()
+    collector.shutdown()
+
+
+def test_weights_are_never_stale_whether_changed_in_place_or_replaced():
+    make, policy = parts("overactuated", "policy")
+    last = policy.module[1].module.decoder.mlp[-1]
+    collector = VectorCollector(make, policy, frames_per_batch=12, total_frames=-1)
+    iterator = iter(collector)
+
+    def action() -> torch.Tensor:
+        return next(iterator)["action"].unique()
+
+    assert len(action()) > 1
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(20.0)
+    assert action().tolist() == [1.0]
+    last.bias = nn.Parameter(torch.full_like(last.bias, -20.0))
+    assert action().tolist() == [-1.0]
+    collector.shutdown()
+
+
+def test_the_exploration_type_is_obeyed():
+    make, policy = parts("overactuated", "explore")
+    collector = VectorCollector(
+        make,
+        policy,
+        frames_per_batch=96,
+        total_frames=-1,
+        exploration_type=ExplorationType.DETERMINISTIC,
+    )
+    batch = next(iter(collector))
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        expected = policy(batch.select("observation", "direction"))["action"]
+    torch.testing.assert_close(batch["action"], expected)
+    collector.shutdown()
+
+
+def test_random_frames_come_first_if_asked_for():
+    make, policy = parts("overactuated", "policy")
+    with torch.no_grad():
+        policy.module[1].module.decoder.mlp[-1].bias.fill_(20.0)
+    collector = VectorCollector(
+        make, policy, frames_per_batch=48, total_frames=96, init_random_frames=48
+    )
+    first, second = collector
+    assert first["action"].std() > 0.3
+    assert second["action"].min() > 0.9
+
+
+def test_an_environment_that_it_does_not_know_is_refused():
+    make, policy = parts("overactuated", "policy")
+    with pytest.raises(ValueError, match="has a StepCounter; use"):
+        VectorCollector(lambda: make().append_transform(StepCounter()), policy, frames_per_batch=12)
+    with pytest.raises(ValueError, match="num_envs=2 or more"):
+        VectorCollector(lambda: make_env("overactuated"), policy, frames_per_batch=12)

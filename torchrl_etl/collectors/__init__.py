@@ -1,0 +1,16 @@
+"""Where frames come from: one process, several, or several machines."""
+
+from torchrl_etl.collectors.batches import Batches, CollectionError
+from torchrl_etl.collectors.factory import COLLECTORS, make_batches
+from torchrl_etl.collectors.process import AsyncProcessWorkers, ProcessWorkers
+from torchrl_etl.collectors.vector import VectorCollector
+
+__all__ = [
+    "COLLECTORS",
+    "AsyncProcessWorkers",
+    "Batches",
+    "CollectionError",
+    "ProcessWorkers",
+    "VectorCollector",
+    "make_batches",
+]

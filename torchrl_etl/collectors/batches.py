@@ -1,0 +1,191 @@
+"""Batches of a collector, none of which is waited for without end."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.collectors import BaseCollector
+
+__all__ = ["Batches", "CollectionError"]
+
+
+class CollectionError(RuntimeError):
+    """Workers failed, or something was waited for too long."""
+
+
+class Batches:
+    """What a learner needs of any TorchRL collector: the next batch, acted with fresh weights.
+
+    Weights are pushed before each batch is asked for. With ``ahead`` the next batch is asked for
+    as soon as one is delivered, so that it is collected while the learner learns; its policy is
+    then one batch older, and everything is as reproducible as without.
+
+    Args:
+        make_collector (callable): builds the collector.
+
+    Keyword Args:
+        in_process (bool): whether it collects in this process, where nothing is waited for.
+            Default: ``False``.
+        ahead (bool): collect the next batch while the learner works on this one.
+            Default: ``False``.
+        restarts (bool): whether the collector can begin new episodes from a seed while it runs.
+            Default: ``True``.
+        timeout (float): most seconds to wait for anything: the start, a batch, a push.
+            Default: 120.
+
+    Raises:
+        CollectionError: from every method, if workers fail or a wait passes its limit.
+
+    Examples:
+        >>> from functools import partial
+        >>> from torchrl_etl.collectors import Batches, VectorCollector
+        >>> from torchrl_etl.envs import make_env
+        >>> from torchrl_etl.modules import make_actor
+        >>> env = make_env("overactuated", num_envs=2)
+        >>> actor = make_actor({"observation": 6}, env.full_action_spec_unbatched["action"])
+        >>> make = partial(VectorCollector, env, actor, frames_per_batch=8, total_frames=-1)
+        >>> batches = Batches(make, in_process=True)
+        >>> batches.restart(seed=0)
+        >>> batches.next().shape
+        torch.Size([2, 4])
+        >>> batches.close()
+    """
+
+    def __init__(
+        self,
+        make_collector: Callable[[], BaseCollector],
+        *,
+        in_process: bool = False,
+        ahead: bool = False,
+        restarts: bool = True,
+        timeout: float = 120.0,
+    ) -> None:
+        if in_process and ahead:
+            raise ValueError(
+                "ahead=True collects while the learner learns, which takes a second process; use "
+                "another kind of collector."
+            )
+        self._caller = None if in_process else _Caller()
+        self._ahead, self._restarts, self._timeout = ahead, restarts, timeout
+        self._next: Future[TensorDictBase] | None = None
+        self._is_stuck = False
+        self._collector: BaseCollector | None = None
+        self._collector = self._do("start", make_collector)
+        self._iterator = iter(self._collector)
+
+    def restart(self, seed: int) -> None:
+        """Begin new episodes that depend on the seed and the weights alone.
+
+        A batch under way is dropped; it was never counted. A collector that cannot restart goes on.
+        """
+        if self._restarts:
+            if self._next is not None:
+                self._wait("give a batch", self._next)
+                self._next = None
+            self._do("take a seed", self._collector.set_seed, seed)
+            if self._caller is None:  # workers have been reset by that already
+                self._collector.reset()
+
+    def next(self) -> TensorDictBase:
+        """The next batch, with the collector's batch size."""
+        batch = self._wait("give a batch", self._next or self._ask())
+        self._next = self._ask() if self._ahead else None
+        return batch
+
+    def close(self) -> None:
+        """Stop the workers, by force if they do not listen; again does nothing."""
+        if self._collector is None:
+            return
+        collector, self._collector, self._iterator, self._next = self._collector, None, None, None
+        if self._is_stuck:  # the thread still waits for a worker; another one speaks to the rest
+            _kill(collector)
+            self._caller = _Caller()
+        self._timeout = min(self._timeout, 30.0)
+        try:
+            self._do("stop", collector.shutdown)
+        except CollectionError:
+            _kill(collector)
+        if self._caller is not None:
+            self._caller.stop()
+
+    def _ask(self) -> Future[TensorDictBase]:
+        if self._caller is not None:
+            self._do("take new weights", self._collector.update_policy_weights_)
+        return self._call(next, self._iterator)
+
+    def _do(self, what: str, function: Callable[..., Any], *args: Any) -> Any:
+        return self._wait(what, self._call(function, *args))
+
+    def _call(self, function: Callable[..., Any], *args: Any) -> Future:
+        if self._caller is not None:
+            return self._caller.call(function, *args)
+        future: Future = Future()
+        future.set_result(function(*args))
+        return future
+
+    def _wait(self, what: str, future: Future) -> Any:
+        go_on = "The run can go on from its last checkpoint: resume=FOLDER."
+        deadline = time.monotonic() + self._timeout
+        while time.monotonic() < deadline:
+            try:
+                return future.result(min(1.0, self._timeout))
+            except TimeoutError:
+                # TorchRL 0.14.1 notices a dead worker when it waits for a batch, but not when it
+                # waits for an answer.
+                for index, process in enumerate(getattr(self._collector, "procs", ())):
+                    if process.exitcode is not None:
+                        self._is_stuck = True
+                        raise CollectionError(
+                            f"The collector's workers did not {what}: worker {index} ended (exit "
+                            f"code {process.exitcode}). {go_on}"
+                        ) from None
+            except RuntimeError as error:
+                if self._caller is None:
+                    raise
+                advice = "" if "resume=" in str(error) else go_on
+                raise CollectionError(
+                    f"The collector's workers did not {what}: {error} {advice}".strip()
+                ) from error
+        self._is_stuck = True
+        raise CollectionError(
+            f"The collector's workers did not {what} within {self._timeout:g} s; look for a "
+            f"hanging simulator or network, or raise collector.timeout. {go_on}"
+        )
+
+
+def _kill(collector: BaseCollector) -> None:
+    for process in getattr(collector, "procs", ()):
+        with suppress(ValueError):  # closed
+            process.kill()
+
+
+class _Caller:
+    """Calls functions one after another, in a thread that the end of the process does not await."""
+
+    def __init__(self) -> None:
+        self._calls: queue.SimpleQueue[tuple[Future, Callable, tuple] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def call(self, function: Callable[..., Any], *args: Any) -> Future:
+        future: Future = Future()
+        self._calls.put((future, function, args))
+        return future
+
+    def stop(self) -> None:
+        self._calls.put(None)
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            future, function, args = call
+            try:
+                future.set_result(function(*args))
+            except BaseException as error:  # it is for the one who waits
+                future.set_exception(error)
+            del call, future, function, args

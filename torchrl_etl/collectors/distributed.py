@@ -1,0 +1,275 @@
+"""Collector workers in a torch.distributed process group: local processes or Slurm jobs."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import timedelta
+from functools import partial
+from typing import Any, Literal
+from unittest.mock import patch
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.collectors.distributed import DistributedCollector, generic
+from torchrl.envs import EnvBase
+from torchrl.weight_update import DistributedWeightSyncScheme
+
+from torchrl_etl.collectors.remote import (
+    RemoteWorkers,
+    check_arguments,
+    cpu_copy,
+    seeded_env,
+    worker_seed,
+)
+
+__all__ = ["DistributedWorkers"]
+
+
+class DistributedWorkers(RemoteWorkers, DistributedCollector):
+    """TorchRL's ``DistributedCollector`` whose waits end, and whose workers take turns.
+
+    Workers and learner form one process group of ``torch.distributed``; batches and weights travel
+    through it. Its members are fixed, so a worker that is lost ends the run, with a message that
+    names it; on machines that come and go use :class:`~torchrl_etl.collectors.ray.RayWorkers`.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold.
+
+    Args:
+        create_env_fn (callable): builds a worker's environment. It is called once in the learner's
+            process as well, to learn what a batch looks like.
+        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
+            parameters reach the workers through :meth:`update_policy_weights_`.
+
+    Keyword Args:
+        num_workers (int): number of processes or jobs.
+        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
+            worker that it comes from.
+        total_frames (int): iteration ends there. Defaults to -1: no end.
+        sync (bool): one stacked batch of all workers instead of the first that is ready.
+            Defaults to ``False``.
+        seed (int): each worker gets its own seed from it. Defaults to 0.
+        timeout (float): most seconds to wait for the workers to start, for a batch, and for
+            a worker to take weights. Defaults to 300.
+        launcher (str): ``"mp"`` starts processes on this machine, ``"submitit"`` jobs (on Slurm,
+            described by ``slurm_kwargs``). Defaults to ``"mp"``.
+        tcp_port (int, optional): where the workers meet. Defaults to a free port.
+        collector_class (type): class of the workers' collectors. Defaults to
+            :class:`~torchrl.collectors.Collector`.
+        collector_kwargs (mapping, optional): more arguments for it.
+        **kwargs: see :class:`~torchrl.collectors.distributed.DistributedCollector`.
+
+    Raises:
+        TypeError, ValueError: for bad arguments, before anything is started.
+        RuntimeError: if workers do not start in time, or one is lost.
+
+    Examples:
+        >>> from torchrl_etl.collectors.distributed import DistributedWorkers
+        >>> from torchrl_etl.envs import make_env
+        >>> collector = DistributedWorkers(  # doctest: +SKIP
+        ...     lambda: make_env("myoHandPose", num_envs=8),
+        ...     TensorDictSequential(actor, decoder),
+        ...     num_workers=2,
+        ...     frames_per_batch=400,
+        ... )
+        >>> for batch in collector:  # doctest: +SKIP
+        ...     learn(batch)
+        ...     collector.update_policy_weights_()
+    """
+
+    def __init__(
+        self,
+        create_env_fn: Callable[[], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        num_workers: int,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        sync: bool = False,
+        seed: int = 0,
+        timeout: float = 300.0,
+        launcher: Literal["mp", "submitit"] = "mp",
+        tcp_port: int | None = None,
+        collector_class: type[Collector] = Collector,
+        collector_kwargs: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        collector_kwargs = dict(collector_kwargs or {})
+        check_arguments(
+            create_env_fn,
+            policy,
+            num_workers=num_workers,
+            frames_per_batch=frames_per_batch,
+            sync=sync,
+            timeout=timeout,
+            collector_class=collector_class,
+            collector_kwargs=collector_kwargs,
+        )
+        if launcher not in ("mp", "submitit"):
+            raise ValueError(f"launcher must be 'mp' or 'submitit', got {launcher!r}.")
+        if launcher == "submitit" and not generic._has_submitit:
+            raise ImportError(
+                "launcher='submitit' needs submitit: pip install 'torchrl_etl[slurm]'."
+            )
+        if torch.distributed.is_initialized():
+            raise RuntimeError(
+                "DistributedWorkers needs torch's default process group for itself, and there is "
+                "one already in this process. Use RayWorkers, or destroy_process_group() first."
+            )
+        self.timeout, self._trackers, self._asked = timeout, {}, {}
+        own_policy = cpu_copy(policy)
+        collector_kwargs = {"auto_register_policy_transforms": False, **collector_kwargs}
+        share = frames_per_batch // num_workers if sync else frames_per_batch
+        # In the place of a batch that TorchRL 0.14.1 collects when the workers run already, and by
+        # the base class Collector, whose batches may have other entries than collector_class's.
+        self._example = _one_batch(
+            collector_class,
+            create_env_fn,
+            own_policy,
+            frames_per_batch=share,
+            **collector_kwargs,
+        )
+        scheme = DistributedWeightSyncScheme()
+        # TorchRL 0.14.1 takes its limit for all waits of the process group, 1000, in days; and its
+        # set_seed ends the workers, so that their main function has to seed them.
+        days, main = timeout / 86_400, partial(_seeded_main, seed)
+        mended = {"MAX_TIME_TO_CONNECT": days, "_distributed_init_collection_node": main}
+        self.launcher, self.jobs, self._weight_sync_schemes = launcher, [], None
+        try:
+            with patch.multiple(generic, **mended):
+                super().__init__(
+                    [create_env_fn] * num_workers,
+                    own_policy,
+                    frames_per_batch=share,
+                    sync=False,  # the one protocol of TorchRL's whose answers can be polled
+                    launcher=launcher,
+                    tcp_port=tcp_port or _free_port(),
+                    collector_class=collector_class,
+                    collector_kwargs=collector_kwargs,
+                    weight_sync_schemes={"policy": scheme},
+                    **kwargs,
+                )
+        except BaseException as error:
+            dead = self._dead()
+            self.shutdown()
+            if not isinstance(error, Exception):
+                raise
+            who = f"worker {dead[0]} ended while it started" if dead else "workers did not start"
+            raise RuntimeError(
+                f"DistributedWorkers: {who} (limit {timeout:g} s; its own message is in its "
+                f"output). {error}"
+            ) from error
+        for store in (self._store, scheme._store):  # the workers' own ends wait for longer
+            store.set_timeout(timedelta(seconds=timeout))
+        self.policy, self.frames_per_batch = policy, frames_per_batch
+        self._prepare(policy, sync, total_frames, timeout)
+        self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has sent the weights
+
+    def _make_container(self) -> None:
+        self._tensordict_out = [self._example.clone().lock_() for _ in range(self.num_workers)]
+
+    def _dead(self) -> list[int]:
+        """Workers whose process or job has ended."""
+        ended = [not job.is_alive() if self.launcher == "mp" else job.done() for job in self.jobs]
+        return [worker for worker, has in enumerate(ended) if has]
+
+    # Batches ---------------------------------------------------------------------------------
+
+    def _ask(self, worker: int) -> None:
+        rank = worker + 1
+        try:
+            if self._news(worker):
+                # It is idle: no weights change within a batch.
+                self._weight_sync_schemes["policy"].send(self._weights, worker_ids=worker)
+            # Said for the worker. TorchRL 0.14.1 lets it say so itself and until then takes the
+            # "done" of its last batch for one of the next, which it then waits for.
+            self._store.set(f"NODE_{rank}_status", b"busy")
+            self._store.set(f"NODE_{rank}_in", b"continue")
+            out = self._tensordict_out[worker]
+            self._trackers[worker] = out.irecv(src=rank, return_premature=True)
+            self._asked[worker] = time.monotonic()
+        except RuntimeError as error:
+            raise self._lost(worker, f"did not take weights ({error})") from error
+
+    def _take(self) -> tuple[int, TensorDictBase]:
+        worker = self._wait()
+        try:
+            for tracker in self._trackers.pop(worker):
+                tracker.wait()
+        except RuntimeError as error:
+            raise self._lost(worker, f"was lost while it sent a batch ({error})") from error
+        return worker, self._signed(self._tensordict_out[worker].clone(), worker)
+
+    def _wait(self) -> int:
+        """The worker that was asked first among those that have a batch."""
+        pause = 0.001
+        while True:
+            asked = list(self._trackers)
+            states = self._store.multi_get([f"NODE_{worker + 1}_status" for worker in asked])
+            busy = [worker for worker, state in zip(asked, states, strict=True) if state == b"busy"]
+            for worker in set(busy) & set(self._dead()):
+                raise self._lost(worker, "has ended")
+            for worker in busy:
+                if time.monotonic() - self._asked[worker] > self.timeout:
+                    raise self._lost(worker, f"gave no batch in {self.timeout:g} s")
+            if len(busy) < len(asked):
+                return next(worker for worker in asked if worker not in busy)
+            time.sleep(pause)
+            pause = min(2 * pause, 0.02)
+
+    def shutdown(self, timeout: float | None = None) -> None:
+        """Asks the workers to end, and kills them after ``timeout`` (5 s); again does nothing."""
+        if getattr(self, "_shutdown", False):
+            return
+        self._shutdown = self._stopped = True
+        # Not TorchRL's: it waits for an answer of every worker, and raises if one is dead; nor does
+        # it stop the threads that wait for weights, each of which costs its worker 5 s.
+        limit = time.monotonic() + (5.0 if timeout is None else timeout)
+        with suppress(RuntimeError, AttributeError):  # the learner may have come less far
+            self._store.set("TRAINER_status", b"shutdown")
+            for worker in range(self.num_workers):
+                self._weight_sync_schemes["policy"]._store.set(f"NODE_{worker + 1}_in", b"stop")
+                self._store.set(f"NODE_{worker + 1}_in", b"shutdown")
+        while len(self._dead()) < len(self.jobs) and time.monotonic() < limit:
+            time.sleep(0.01)
+        for job in self.jobs:
+            if self.launcher == "mp":
+                job.kill()
+                job.join(1.0)
+            else:
+                job.cancel()
+        for scheme in (self._weight_sync_schemes or {}).values():
+            scheme.shutdown()
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        else:  # torch 2.13 counts a group that failed to start, and new workers do not
+            torch.distributed.distributed_c10d._world.group_count = 0
+
+
+_main = generic._distributed_init_collection_node
+
+
+def _seeded_main(seed: int, **kwargs: Any) -> None:
+    """A worker's main function: TorchRL's, with an environment that is built and seeded here."""
+    kwargs["env_make"] = seeded_env(kwargs["env_make"], worker_seed(seed, kwargs["rank"] - 1))
+    _main(**kwargs)
+
+
+def _one_batch(collector_class: type[Collector], create_env_fn, policy, **kwargs) -> TensorDictBase:
+    with torch.random.fork_rng(devices=[]):
+        collector = collector_class(
+            create_env_fn, policy, total_frames=-1, return_same_td=True, **kwargs
+        )
+        try:
+            return next(iter(collector)).clone()
+        finally:
+            collector.shutdown()
+
+
+def _free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("", 0))
+        return listener.getsockname()[1]

@@ -1,0 +1,101 @@
+"""Collector workers in processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase
+
+from torchrl_etl.collectors.vector import VectorCollector
+
+__all__ = ["AsyncProcessWorkers", "ProcessWorkers"]
+
+
+class _OwnWeights:
+    """Workers that act with a copy of the policy, renewed when the learner says so.
+
+    TorchRL 0.14.1 moves the given policy itself into shared memory, so that every optimizer step
+    reaches the workers in the middle of their rollouts.
+    """
+
+    def __init__(
+        self,
+        create_env_fn: Callable[[], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        num_workers: int,
+        **kwargs: Any,
+    ) -> None:
+        self._learner = policy
+        kwargs = {"collector_class": VectorCollector, "use_buffers": True, **kwargs}
+        super().__init__(
+            [create_env_fn] * num_workers,
+            deepcopy(policy).cpu(),
+            init_fn=_leave_ctrl_c_to_the_learner,
+            num_threads=torch.get_num_threads(),  # TorchRL would take one from us for each worker
+            **kwargs,
+        )
+
+    def update_policy_weights_(
+        self,
+        policy_or_weights: TensorDictBase | nn.Module | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Gives the workers weights: by default, those that the learner's policy has now."""
+        super().update_policy_weights_(
+            self._learner if policy_or_weights is None else policy_or_weights, **kwargs
+        )
+
+
+class ProcessWorkers(_OwnWeights, MultiSyncCollector):
+    """TorchRL's ``MultiSyncCollector``: a batch is made of one part from each worker.
+
+    Every rollout acts with the weights of the last :meth:`update_policy_weights_` before it was
+    asked for, from its first step to its last.
+
+    Args:
+        create_env_fn (callable): builds a worker's environment.
+        policy (TensorDictModuleBase): what acts; workers get a copy.
+
+    Keyword Args:
+        num_workers (int): number of processes.
+        frames_per_batch (int): frames of a batch over all workers.
+        **kwargs: see :class:`torchrl.collectors.MultiSyncCollector`; ``collector_class`` defaults
+            to :class:`~torchrl_etl.collectors.VectorCollector`.
+
+    Examples:
+        >>> from functools import partial
+        >>> from torchrl_etl.collectors import ProcessWorkers
+        >>> from torchrl_etl.envs import make_env
+        >>> from torchrl_etl.modules import make_actor
+        >>> make = partial(make_env, "overactuated", num_envs=4)
+        >>> actor = make_actor({"observation": 6}, make().full_action_spec_unbatched["action"])
+        >>> collector = ProcessWorkers(  # doctest: +SKIP
+        ...     make, actor, num_workers=2, frames_per_batch=64, total_frames=-1
+        ... )
+    """
+
+
+class AsyncProcessWorkers(_OwnWeights, MultiAsyncCollector):
+    """TorchRL's ``MultiAsyncCollector``: each batch is one worker's, and workers never wait.
+
+    New weights land in the middle of rollouts. What was executed is recorded as it happens, so
+    transitions stay true; only their policy is a mixture.
+
+    Args and Keyword Args as for :class:`ProcessWorkers`, but ``frames_per_batch`` is of one worker.
+    """
+
+
+def _leave_ctrl_c_to_the_learner() -> None:
+    # A terminal sends it to every process; the learner stops the workers when it has saved.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["OMP_NUM_THREADS"] = "1"

@@ -1,0 +1,282 @@
+"""Collector workers on the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.collectors.distributed import RayCollector
+from torchrl.collectors.weight_update import RemoteModuleWeightUpdater
+from torchrl.envs import EnvBase
+
+from torchrl_etl.collectors.remote import (
+    RemoteWorkers,
+    check_arguments,
+    cpu_copy,
+    seeded_env,
+    worker_seed,
+)
+
+__all__ = ["RayWorkers"]
+
+
+class RayWorkers(RemoteWorkers, RayCollector):
+    """TorchRL's :class:`~torchrl.collectors.distributed.RayCollector` that survives its workers.
+
+    Each worker is a Ray actor that runs ``collector_class`` on one (batched) environment. What
+    is added: weights travel through Ray's object store, in the order of the requests for
+    batches; every wait has a limit; a worker that is lost, or gives no answer in time, is
+    replaced by one with the newest weights and a seed of its own, ``replacements`` times.
+    The batch it had under way is never delivered, so no frame is counted twice.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold.
+
+    Args:
+        create_env_fn (callable): builds a worker's environment.
+        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
+            parameters reach the workers through :meth:`update_policy_weights_`.
+
+    Keyword Args:
+        num_workers (int): number of Ray actors.
+        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
+            worker that it comes from.
+        total_frames (int): iteration ends there. Defaults to -1: no end.
+        sync (bool): one stacked batch of all workers instead of the first that is ready.
+            Defaults to ``False``.
+        seed (int): each worker, and each replacement, gets its own seed from it. Defaults to 0.
+        timeout (float): most seconds to wait for the workers to start, and for a batch.
+            A replacement has to start and collect in it. Defaults to 300.
+        replacements (int): lost workers to replace before giving up. Defaults to 3.
+        address (str, optional): Ray cluster to join: ``"auto"``, ``"host:port"`` or
+            ``"ray://host:port"``. By default a local one is started, and ended by
+            :meth:`shutdown`. Where Ray is running in this process already, it is used.
+        collector_class (type): class of the workers' collectors. Defaults to
+            :class:`~torchrl.collectors.Collector`.
+        collector_kwargs (mapping, optional): more arguments for it.
+        ray_init_config (mapping, optional): more arguments for ``ray.init``.
+        remote_configs (mapping, optional): what Ray reserves for a worker and where it is placed,
+            as in ``ray.remote``. Defaults to ``{"num_cpus": 1}``; Ray gives a worker as many
+            OpenMP threads as CPUs.
+        **kwargs: see :class:`~torchrl.collectors.distributed.RayCollector`.
+
+    Raises:
+        ImportError: if Ray is not installed.
+        TypeError, ValueError: for bad arguments, before anything is started.
+        RuntimeError: if workers do not start in time, or more are lost than may be replaced.
+
+    Examples:
+        >>> from torchrl_etl.collectors.ray import RayWorkers
+        >>> from torchrl_etl.envs import make_env
+        >>> collector = RayWorkers(  # doctest: +SKIP
+        ...     lambda: make_env("myoHandPose", num_envs=8),
+        ...     TensorDictSequential(actor, decoder),
+        ...     num_workers=2,
+        ...     frames_per_batch=400,
+        ...     address="auto",
+        ... )
+        >>> for batch in collector:  # doctest: +SKIP
+        ...     learn(batch)
+        ...     collector.update_policy_weights_()
+    """
+
+    def __init__(
+        self,
+        create_env_fn: Callable[[], EnvBase],
+        policy: TensorDictModuleBase,
+        *,
+        num_workers: int,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        sync: bool = False,
+        seed: int = 0,
+        timeout: float = 300.0,
+        replacements: int = 3,
+        address: str | None = None,
+        collector_class: type[Collector] = Collector,
+        collector_kwargs: Mapping[str, Any] | None = None,
+        ray_init_config: Mapping[str, Any] | None = None,
+        remote_configs: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        collector_kwargs = dict(collector_kwargs or {})
+        check_arguments(
+            create_env_fn,
+            policy,
+            num_workers=num_workers,
+            frames_per_batch=frames_per_batch,
+            sync=sync,
+            timeout=timeout,
+            collector_class=collector_class,
+            collector_kwargs=collector_kwargs,
+        )
+        if not isinstance(replacements, int) or replacements < 0:
+            raise ValueError(
+                f"replacements must be an integer of at least 0, got {replacements!r}."
+            )
+        if importlib.util.find_spec("ray") is None:
+            raise ImportError(
+                "RayWorkers needs Ray: pip install 'ray>=2.50' (or torchrl_etl[ray])."
+            )
+        self.create_env_fn, self.seed, self.started = create_env_fn, seed, 0
+        self.replacements = replacements
+        self._prepare(policy, sync, total_frames, timeout)
+        self._pending: dict[Any, tuple[int, Any, float]] = {}
+        remote_configs = {"num_cpus": 1, **(remote_configs or {})}
+        ray_config = {"address": address or "local", "log_to_driver": False}
+        ray_config |= {"logging_level": "error"}
+        if address is None:  # how many workers this machine can bear is the caller's to say
+            slots = int(num_workers * remote_configs["num_cpus"]) + 1
+            ray_config |= {"num_cpus": max(slots, os.cpu_count()), "include_dashboard": False}
+        try:
+            super().__init__(
+                create_env_fn,
+                policy,
+                num_collectors=num_workers,
+                frames_per_batch=frames_per_batch,
+                total_frames=self.total_frames,
+                sync=sync,
+                collector_class=_seeded(collector_class),
+                collector_kwargs={"auto_register_policy_transforms": False, **collector_kwargs},
+                ray_init_config=ray_config | dict(ray_init_config or {}),
+                remote_configs=remote_configs,
+                # Weights are not left to a scheme. The one of TorchRL 0.14.1 joins all workers in
+                # a process group that a replacement cannot enter, waits for batches under way, and
+                # fails after 60 s of waiting.
+                weight_updater=RemoteModuleWeightUpdater(),
+                **kwargs,
+            )
+            self._await_start()
+        except BaseException:
+            if hasattr(self, "_runtime_lease"):
+                self.shutdown()
+            raise
+
+    # Workers ---------------------------------------------------------------------------------
+
+    def add_collectors(
+        self, create_env_fn, num_envs, policy, collector_kwargs, remote_configs
+    ) -> None:
+        """Starts the workers; called once, by TorchRL's constructor."""
+        self._recipe = collector_kwargs, remote_configs
+        self._remote_collectors.extend(self._start(worker) for worker in range(len(create_env_fn)))
+
+    def _start(self, worker: int) -> Any:
+        """A new actor with the newest weights and a seed that none had before."""
+        kwargs, config = (of_workers[worker] for of_workers in self._recipe)
+        seed = worker_seed(self.seed, self.started)
+        self.started += 1
+        self._known[worker] = self.policy_version
+        policy = cpu_copy(self.policy)
+        self._weights.to_module(policy)
+        return self.collector_class.as_remote(config).remote(
+            self.create_env_fn, policy, seed, total_frames=-1, **{**kwargs, "worker_idx": worker}
+        )
+
+    def _await_start(self) -> None:
+        import ray
+
+        ready = [worker.__ray_ready__.remote() for worker in self._remote_collectors]
+        done, late = ray.wait(ready, num_returns=len(ready), timeout=self.timeout)
+        for worker, future in enumerate(ready):
+            if future in done:
+                try:
+                    self._get(future, worker)
+                except ray.exceptions.RayError as error:
+                    raise self._lost(worker, f"could not be started: {error}") from error
+        if late:
+            raise RuntimeError(
+                f"RayWorkers: {len(late)} of {len(ready)} workers did not start in "
+                f"{self.timeout:g} s. Each asks for {self._recipe[1][0]}; the cluster has "
+                f"{ray.available_resources()} to spare. Ask for fewer workers or less, add "
+                "nodes, or raise timeout."
+            )
+
+    def _get(self, future: Any, worker: int) -> Any:
+        """The value of a future that is ready."""
+        import ray
+
+        try:
+            return ray.get(future, timeout=self.timeout)
+        except ray.exceptions.RayTaskError as error:  # its own code; a replacement would repeat it
+            raise self._lost(worker, f"failed: {error}") from error
+
+    # Batches ---------------------------------------------------------------------------------
+
+    def _ask(self, worker: int) -> None:
+        import ray
+
+        actor, push = self._remote_collectors[worker], None
+        if self._news(worker):
+            # One copy in the object store for all workers; nodes pass it on among themselves.
+            if getattr(self, "_stored", (None,))[0] is not self._weights:
+                self._stored = self._weights, ray.put(self._weights)
+            push = actor.update_policy_weights_.remote(self._stored[1])
+        self._pending[actor.next.remote()] = worker, push, time.monotonic()
+
+    def _take(self) -> tuple[int, TensorDictBase]:
+        import ray
+
+        while True:
+            oldest = min(asked for _, _, asked in self._pending.values())
+            left = oldest + self.timeout - time.monotonic()
+            if left <= 0:
+                self._replace_the_late()
+                left = 1.0
+            done, _ = ray.wait(list(self._pending), num_returns=1, timeout=left)
+            if not done:
+                continue
+            worker, push, _ = self._pending.pop(done[0])
+            try:
+                if push is not None:
+                    self._get(push, worker)
+                batch = self._get(done[0], worker)
+            except ray.exceptions.RayError as error:  # the actor, its node or the object is gone
+                self._replace(worker, f"was lost ({type(error).__name__})", error)
+                continue
+            return worker, self._signed(batch, worker)
+
+    def _replace_the_late(self) -> None:
+        import ray
+
+        _, busy = ray.wait(list(self._pending), num_returns=len(self._pending), timeout=0)
+        for future in busy:
+            if time.monotonic() - self._pending[future][2] >= self.timeout:
+                worker = self._pending.pop(future)[0]
+                self._replace(worker, f"gave no batch in {self.timeout:g} s")
+
+    def _replace(self, worker: int, cause: str, error: Exception | None = None) -> None:
+        import ray
+
+        ray.kill(self._remote_collectors[worker])
+        lost = self.started - self.num_workers
+        if lost >= self.replacements:
+            raise self._lost(worker, f"{cause}; {lost} were replaced before it") from error
+        self._remote_collectors[worker] = self._start(worker)
+        self._ask(worker)
+
+    def shutdown(self, timeout: float | None = None, shutdown_ray: bool = False) -> None:
+        """Ends the workers, and the Ray that was started for them; again does nothing."""
+        self._stopped = True
+        self._pending.clear()
+        super().shutdown(timeout, shutdown_ray)
+
+
+def _seeded(collector_class: type[Collector]) -> type[Collector]:
+    """The class as it runs in a worker, which it seeds before all else. Ray sends it by value."""
+
+    class Seeded(collector_class):
+        def __init__(self, create_env_fn, policy, seed, **kwargs):
+            super().__init__(seeded_env(create_env_fn, seed), policy, **kwargs)
+
+        # Ray asks for an actor's truth when it reports an exception. TorchRL 0.14.1 answers with
+        # its length, which is infinite: the worker would die, and the exception be lost.
+        def __bool__(self):
+            return True
+
+    Seeded.__name__ = Seeded.__qualname__ = collector_class.__name__
+    return Seeded

@@ -1,0 +1,39 @@
+"""Target networks that follow in one operation."""
+
+from __future__ import annotations
+
+import torch
+from torchrl.objectives import SoftUpdate
+
+__all__ = ["FusedSoftUpdate"]
+
+
+class FusedSoftUpdate(SoftUpdate):
+    """:class:`torchrl.objectives.SoftUpdate`, all parameters at once instead of one by one.
+
+    Args:
+        loss_module (LossModule): the loss whose target parameters follow.
+
+    Keyword Args:
+        tau (float) or eps (float): see :class:`torchrl.objectives.SoftUpdate`.
+
+    Examples:
+        >>> from torchrl_etl.modules import StateEncoder
+        >>> from torchrl_etl.objectives import BehavioralMetricLoss, FusedSoftUpdate
+        >>> loss = BehavioralMetricLoss(StateEncoder(observation_dim=7, embedding_dim=4))
+        >>> updater = FusedSoftUpdate(loss, tau=0.01)
+        >>> updater.step()
+    """
+
+    def init_(self) -> None:
+        super().init_()
+        pairs = (
+            (self._targets.get((f"target_{name}", *key)), source)
+            for (name, *key), source in self._sources.items(True, True)
+        )
+        self._pairs = tuple(map(list, zip(*pairs, strict=True)))
+
+    @torch.no_grad()
+    def step(self) -> None:
+        targets, sources = self._pairs
+        torch._foreach_lerp_(targets, sources, 1 - self.eps)
