@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", choices=OURS, default=OURS)
     parser.add_argument("--frames-per-update", nargs="+", type=int, default=(1, 16), choices=FRAMES)
     parser.add_argument("--peer", help="Python with stable-baselines3; see `make bench`")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=4)
     arguments = parser.parse_args()
     for frames_per_update in arguments.frames_per_update:
         compare(arguments.env, frames_per_update, arguments)

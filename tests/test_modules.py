@@ -354,7 +354,7 @@ def test_layer_norm_follows_every_hidden_layer_or_none(layer_norm: bool) -> None
         assert norms == ([(16,), (12,)] if layer_norm else [])
 
 
-def test_a_critic_is_a_perceptron_on_its_joined_inputs():
+def test_a_critic_is_a_perceptron_on_its_joined_inputs() -> None:
     critic = make_critic({"observation": 3, "direction": 2, "action": 4}, hidden=(8,))
     inputs = [torch.randn(2, 5, size) for size in (3, 2, 4)]
     joined = nn.Sequential(*critic.module)(torch.cat(inputs, -1))
