@@ -161,6 +161,8 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
     batches.close()
     stock.shutdown()
     bare.close()
+    for scheme in stock._weight_sync_schemes.values():  # else its __del__ hangs at exit
+        scheme.shutdown()
 
 
 def recipe_env(task: str, num_envs: int) -> EnvBase:

@@ -56,6 +56,17 @@ class _OwnWeights:
         )
 
 
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """Stop the workers, and what carries weights to them.
+
+        TorchRL 0.14.1 leaves the latter to its ``__del__``, which hangs if it is called by the end
+        of the process, when no thread can be started any more.
+        """
+        super().shutdown(*args, **kwargs)
+        for scheme in (self._weight_sync_schemes or {}).values():
+            scheme.shutdown()
+
+
 class ProcessWorkers(_OwnWeights, MultiSyncCollector):
     """TorchRL's ``MultiSyncCollector``: a batch is made of one part from each worker.
 
