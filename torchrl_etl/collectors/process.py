@@ -55,7 +55,6 @@ class _OwnWeights:
             self._learner if policy_or_weights is None else policy_or_weights, **kwargs
         )
 
-
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
         """Stop the workers, and what carries weights to them.
 
