@@ -20,13 +20,13 @@ HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "performance.md"
 CSV = HERE.parent / "docs" / "results" / "performance.csv"
 NAMES = ("collection", "update", "end_to_end", "transforms", "memory")
-WITH_PEER = ("update", "end_to_end")
+OPTIONS = {"update": ["--compile", "--repeats", "5"]}
 BEGIN, END = "<!-- table: make bench -->\n", "<!-- end of table -->\n"
 
 
 def run(name: str, peer: str | None) -> list[dict[str, Any]]:
-    command = [sys.executable, str(HERE / f"{name}.py")]
-    if peer and name in WITH_PEER:
+    command = [sys.executable, str(HERE / f"{name}.py"), *OPTIONS.get(name, [])]
+    if peer and name == "end_to_end":
         command += ["--peer", peer]
     rows = []
     # Each benchmark decides on its own threads.

@@ -1,7 +1,7 @@
 """Milliseconds an update: ours, TorchRL's own recipe, Stable-Baselines3, and the products alone.
 
     python benchmarks/update.py
-    make peers && python benchmarks/update.py --compile --repeats 15
+    make .venv-peers/.complete && python benchmarks/update.py --compile --repeats 15
 
 One thread and CPU time, so that other processes disturb little; the cases take turns in blocks of
 updates. ``floor`` is what ``torch.mm`` takes for exactly the products of an update, each on tensors
@@ -9,7 +9,8 @@ of its own, without a gradient where none is needed. Random transitions of one t
 for a buffer: the cost of an update does not depend on what they hold.
 
 ``sac`` is SAC on raw actions, the same nets for all three libraries; ``explore`` and ``learn`` are
-the whole updates of both stages. A ratio is to the floor, but to ours for TorchRL and its peer.
+the whole updates of both stages. A ratio is to the floor; for TorchRL and Stable-Baselines3 it is
+to ours, compiled if asked.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.training import Experiment
+from torchrl_etl.training.compiled import compiled
 from torchrl_etl.training.stage import Stage, make_optimizer, ready_for_training
 
 ROOT = Path(__file__).parent.parent
@@ -48,16 +50,16 @@ CPU = torch.device("cpu")
 Shape = tuple[int, int, int]
 
 
-def config(env: str, compiled: bool, layer_norm: bool) -> Any:
-    overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compiled).lower()}"]
+def config(env: str, compile: bool, layer_norm: bool) -> Any:
+    overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compile).lower()}"]
     overrides += [f"network.layer_norm={str(layer_norm).lower()}"]
     with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
         return compose("config", overrides=overrides)
 
 
-def stages(env: str, compiled: bool, layer_norm: bool) -> tuple[Stage, Stage]:
+def stages(env: str, compile: bool, layer_norm: bool) -> tuple[Stage, Stage]:
     """Both stages as the recipe builds them, their buffers filled."""
-    experiment = Experiment(config(env, compiled, layer_norm))
+    experiment = Experiment(config(env, compile, layer_norm))
     space = experiment.spec.full_action_spec_unbatched["action"].space
     decoder = SynergyDecoder(
         experiment.config.num_synergies,
@@ -154,34 +156,37 @@ def floor(shapes: list[Shape]) -> Callable[[], object]:
 # Plain SAC ------------------------------------------------------------------------------------
 
 
-def plain_sac(cfg: Any, stage: Stage, lean: bool) -> Callable[[], object]:
-    """SAC on raw actions: with our loss as our stages use it, or as TorchRL's recipe does."""
-    example = stage.buffer.storage[:2]
-    sizes = {key: example[key].shape[-1] for key in ("observation", "action")}
+def plain_sac(cfg: Any, stage: Stage, library: str) -> Callable[[], object]:
+    """SAC on raw actions, with our loss as the stages use it or as TorchRL's recipe does."""
+    kept = stage.buffer.storage[:].select("observation", "action", "next")
+    sizes = {key: kept[key].shape[-1] for key in ("observation", "action")}
     spec = Bounded(-1, 1, shape=(sizes["action"],))
     network = {"hidden": list(cfg.network.hidden), "layer_norm": cfg.network.layer_norm}
     actor = make_actor({"observation": sizes["observation"]}, spec, **network)
-    loss = (LeanSACLoss if lean else SACLoss)(
-        actor, make_critic(sizes, **network), action_spec=spec
-    )
-    if lean:
-        target = ready_for_training(loss, gamma=0.99, tau=0.005)
-        optimizer = make_optimizer(CPU, (loss.parameters(), 3e-4))
-    else:
-        loss.make_value_estimator(gamma=0.99)
+    kind = SACLoss if library == "torchrl" else LeanSACLoss
+    loss = kind(actor, make_critic(sizes, **network), action_spec=spec)
+    target = ready_for_training(loss, gamma=0.99, tau=0.005)
+    parameters = list(loss.parameters())
+    if library == "torchrl":
         target = SoftUpdate(loss, tau=0.005)
-        _ = loss.target_entropy
-        optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+        optimizer = torch.optim.Adam(parameters, lr=3e-4)
+    else:
+        optimizer = make_optimizer(CPU, (parameters, 3e-4))
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(TRANSITIONS), batch_size=cfg.learn.batch_size
     )
-    keys = ("observation", "action", "next")
-    buffer.extend(stage.buffer.storage[:].select(*keys))
+    buffer.extend(kept)
+
+    def gradients(batch: TensorDict) -> tuple[torch.Tensor, ...]:
+        out = loss(batch)
+        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+        return torch.autograd.grad(total, parameters)
+
+    differentiate = compiled(gradients) if library == "compiled" else gradients
 
     def run() -> None:
-        out = loss(buffer.sample())
-        optimizer.zero_grad()
-        (out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]).backward()
+        for parameter, gradient in zip(parameters, differentiate(buffer.sample()), strict=True):
+            parameter.grad = gradient
         optimizer.step()
         target.step()
 
@@ -250,13 +255,14 @@ def main() -> None:
         "floor/sac": timed(floor(sac_products(batch, *sizes, sizes[1], hidden))),
         "floor/explore": timed(floor(stage_products(cfg, "explore", *sizes))),
         "floor/learn": timed(floor(stage_products(cfg, "learn", *sizes))),
-        "ours/sac": timed(plain_sac(cfg, learn, lean=True)),
+        "ours/sac": timed(plain_sac(cfg, learn, "ours")),
         "ours/explore": timed(explore.update),
         "ours/learn": timed(learn.update),
-        "torchrl/sac": timed(plain_sac(cfg, learn, lean=False)),
+        "torchrl/sac": timed(plain_sac(cfg, learn, "torchrl")),
     }
     more: dict[str, Any] = {"cpu": cpu_model(), "layer_norm": arguments.layer_norm}
     if arguments.compile:
+        cases["compiled/sac"] = timed(plain_sac(cfg, learn, "compiled"))
         for stage in stages(arguments.env, True, arguments.layer_norm):
             start = time.perf_counter()
             stage.update(), stage.update()
@@ -273,9 +279,10 @@ def main() -> None:
     values = interleave(cases, arguments.repeats)
     if peer is not None:
         peer.close()
+    ours = "compiled/sac" if arguments.compile else "ours/sac"
     for name, each in values.items():
         library, part = name.split("/")
-        other = "ours/sac" if library in ("torchrl", "stable_baselines3") else f"floor/{part}"
+        other = ours if library in ("torchrl", "stable_baselines3") else f"floor/{part}"
         line("update", name, "ms", each, peer=other, peer_values=values[other], **more)
 
 
