@@ -32,7 +32,8 @@ class PolicyOnArrays:
     faster, and take 10 to 35 s to start.) Any other policy is called with a tensordict.
 
     Args:
-        policy (TensorDictModule): the policy. Its weights may be updated in place or replaced.
+        policy (TensorDictModule): the policy. Its weights may be updated in place at any time;
+            where they were replaced by others, :meth:`refresh` finds out.
 
     Examples:
         >>> import numpy as np
@@ -52,6 +53,15 @@ class PolicyOnArrays:
         self._sequence = _Sequence(leaves, self._in_keys, self._out_keys) if is_plain else None
         self._graph: Callable[..., tuple[Tensor, ...]] | None = None
         self._traced_with: tuple[object, ...] = ()
+        self._shape: torch.Size | None = None
+
+    def refresh(self) -> None:
+        """Look for other weights, or another exploration type, than the graph was traced with.
+
+        It walks through the whole policy, so a rollout does it once and not at every step.
+        """
+        if self._identity() != self._traced_with:
+            self._graph = None
 
     @torch.no_grad()
     def __call__(self, inputs: Arrays, device: torch.device | None = None) -> Arrays:
@@ -64,26 +74,32 @@ class PolicyOnArrays:
             written = self._policy(entries)
             outputs = [written[key] for key in self._out_keys]
         else:
-            outputs = self._current_graph(self._sequence, tensors)(*tensors)
+            if self._graph is None or tensors[0].shape != self._shape:
+                self._graph = self._trace(self._sequence, tensors)
+            outputs = self._graph(*tensors)
         arrays = (output.cpu().numpy() for output in outputs)
         return dict(zip(self._out_keys, arrays, strict=True))
 
-    def _current_graph(
+    def _trace(
         self, sequence: _Sequence, tensors: list[Tensor]
     ) -> Callable[..., tuple[Tensor, ...]]:
+        random = torch.get_rng_state()
+        with warnings.catch_warnings():
+            # Deprecated in PyTorch 2.13, in favour of what is slower to start (see above); and
+            # a distribution's checks of its bounds are constants, as they should be.
+            warnings.simplefilter("ignore")
+            graph = torch.jit.trace(sequence, tuple(tensors), check_trace=False)
+        torch.set_rng_state(random)
+        self._traced_with, self._shape = self._identity(), tensors[0].shape
+        self._held = self._weights()  # so that no other tensor gets the id of one of these
+        return graph
+
+    def _weights(self) -> tuple[Tensor, ...]:
+        return (*self._policy.parameters(), *self._policy.buffers())
+
+    def _identity(self) -> tuple[object, ...]:
         # A graph sees new values in the weights it was traced with, but not new tensors.
-        weights = (*self._policy.parameters(), *self._policy.buffers())
-        traced_with = (*map(id, weights), exploration_type(), tensors[0].shape)
-        if traced_with != self._traced_with:
-            random = torch.get_rng_state()
-            with warnings.catch_warnings():
-                # Deprecated in PyTorch 2.13, in favour of what is slower to start (see above); and
-                # a distribution's checks of its bounds are constants, as they should be.
-                warnings.simplefilter("ignore")
-                self._graph = torch.jit.trace(sequence, tuple(tensors), check_trace=False)
-            torch.set_rng_state(random)
-            self._traced_with, self._weights = traced_with, weights  # kept: ids are not reused
-        return self._graph
+        return (*map(id, self._weights()), exploration_type())
 
 
 class _Sequence(nn.Module):

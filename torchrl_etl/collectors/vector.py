@@ -108,6 +108,7 @@ class VectorCollector(Collector):
             torch.set_rng_state(outside)
 
     def _fill(self, batch: TensorDictBase) -> TensorDictBase:
+        self._policy_on_arrays.refresh()
         carrier = self._carrier
         known = {*self.env.observation_keys, *self.env.state_keys, *self.env.done_keys}
         now: Arrays = {key: carrier[key].numpy() for key in known}
