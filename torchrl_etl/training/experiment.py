@@ -159,6 +159,17 @@ class Experiment:
             **self._options("learn"),
         )
 
+    def blank_decoder(self) -> SynergyDecoder:
+        """An untrained decoder of the sizes that the configuration asks for."""
+        space = self.spec.full_action_spec_unbatched["action"].space
+        return SynergyDecoder(
+            self.config.num_synergies,
+            len(self.actuators),
+            low=space.low,
+            high=space.high,
+            residual=self.config.learn.residual,
+        )
+
     def learned(self) -> LearnStage:
         """Stage 2 with the weights of its newest whole checkpoint.
 
@@ -269,16 +280,9 @@ class Experiment:
         """Let every part object to its arguments now, not when its stage comes."""
         if self.config.synergies is None:
             self.explore_stage()
-            self._env_maker(activations=self._shows_activations)().close()
-        space = self.spec.full_action_spec_unbatched["action"].space
-        blank = SynergyDecoder(
-            self.config.num_synergies,
-            len(self.actuators),
-            low=space.low,
-            high=space.high,
-            residual=self.config.learn.residual,
-        )
-        self.learn_stage(blank)
+            if self._shows_activations:  # otherwise the environment is as that of ``spec``
+                self.make_env(activations=True).close()
+        self.learn_stage(self.blank_decoder())
 
     @property
     def _shows_activations(self) -> bool:
