@@ -15,6 +15,8 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from torchrl_etl.collectors.seeds import training_seed
+
 __all__ = [
     "RemoteWorkers",
     "check_arguments",
@@ -138,14 +140,13 @@ def seeded_env(create_env_fn: Callable[[], EnvBase], seed: int) -> EnvBase:
 def worker_seed(seed: int, index: int) -> int:
     """Seed of the ``index``-th worker of a run.
 
-    Steps of the golden ratio of the range keep the seeds of any number of workers apart. The
-    highest bit is set, which no evaluation seed has.
+    Steps of the golden ratio of the range keep the seeds of any number of workers apart.
 
     Examples:
         >>> len({worker_seed(0, index) for index in range(1000)})
         1000
     """
-    return 2**30 + (seed * 1_000_003 + index * 663_608_941) % 2**30
+    return training_seed(seed, index * 663_608_941)
 
 
 def weights_of(policy: nn.Module | TensorDictBase) -> TensorDictBase:

@@ -28,6 +28,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.collectors import Batches, make_batches
+from torchrl_etl.collectors.seeds import training_seed
 from torchrl_etl.objectives import FusedSoftUpdate
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.compiled import compiled, cuda_graph
@@ -154,12 +155,13 @@ class Stage(ABC):
         A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
+        seed = training_seed(self.seed, self.frames)
         if self.batches is None:
             # Only a run that begins or resumes builds a collector: that must not show.
             random = GlobalRNGState().state_dict()
-            self.batches = self._make_batches(seed=_mix(self.seed, self.frames))
+            self.batches = self._make_batches(seed=seed)
             GlobalRNGState().load_state_dict(random)
-        self.batches.restart(_mix(self.seed, self.frames))
+        self.batches.restart(seed)
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
@@ -222,14 +224,6 @@ class Stage(ABC):
             gc.collect()
         if isinstance(self.buffer.storage, LazyMemmapStorage):
             shutil.rmtree(self.buffer.storage.scratch_dir, ignore_errors=True)
-
-
-def _mix(seed: int, frames: int) -> int:
-    """A seed for the environments of the segment that starts at ``frames``.
-
-    It has its highest bit set, which no evaluation seed has.
-    """
-    return 2**30 + (seed * 1_000_003 + frames) % 2**30
 
 
 def entropy_target(action_spec: Bounded, action_std: float | None) -> float | str:
