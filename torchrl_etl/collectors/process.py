@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable
 from copy import deepcopy
@@ -108,4 +107,3 @@ class AsyncProcessWorkers(_OwnWeights, MultiAsyncCollector):
 def _leave_ctrl_c_to_the_learner() -> None:
     # A terminal sends it to every process; the learner stops the workers when it has saved.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["OMP_NUM_THREADS"] = "1"

@@ -110,10 +110,11 @@ class LeanSACLoss(SACLoss):
         ]
         return torch.stack(values).squeeze(-1)
 
-    def _weights(self, network: str) -> dict[str, Tensor]:
+    def _weights(self, network: str, *, detached: bool = False) -> dict[str, Tensor]:
         """Parameters and buffers of a network by their dotted names."""
         params = getattr(self, f"{network}_params")
-        return {**dict(params.named_parameters()), **dict(params.named_buffers())}
+        weights = {**dict(params.named_parameters()), **dict(params.named_buffers())}
+        return {k: x.detach() for k, x in weights.items()} if detached else weights
 
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         with torch.no_grad():
@@ -138,7 +139,7 @@ class LeanSACLoss(SACLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """See :meth:`torchrl.objectives.SACLoss.actor_loss`."""
         action, log_prob = self._sample(tensordict)
-        fixed = {name: x.detach() for name, x in self._weights("qvalue_network").items()}
+        fixed = self._weights("qvalue_network", detached=True)
         values = self._values(self._at(tensordict, action), fixed)
         each = self._alpha * log_prob - values.min(0).values
         return self._reduced(each, tensordict), {"log_prob": log_prob.detach()}

@@ -154,7 +154,5 @@ class SynergySACLoss(LeanSACLoss):
         return inputs.set(self.decoded_key, self._decode(action))
 
     def _decode(self, synergy: Tensor) -> Tensor:
-        weights = self._weights("decoder_network")
-        if not self.train_decoder:
-            weights = {name: weight.detach() for name, weight in weights.items()}
+        weights = self._weights("decoder_network", detached=not self.train_decoder)
         return call(self.decoder_network, weights, synergy)
