@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torchrl.collectors import BaseCollector
 
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import SynergyDecoder, make_actor
@@ -45,6 +47,28 @@ def was_decoded_by(batch: TensorDictBase, policy: TensorDictSequential) -> bool:
     with torch.no_grad():
         decoded = policy[1](batch.select("synergy").clone())["action"]
     return torch.allclose(batch["action"], decoded, atol=1e-6)
+
+
+def assert_workers_differ(batch: TensorDictBase) -> None:
+    """Two workers, stacked: their episodes begin elsewhere, and explore otherwise."""
+    first, second = batch["observation"][:, :, 0]
+    assert not torch.isclose(first[:, :2], second[:, :2]).any()
+    noise = (batch["synergy"][:, :, 0].atanh() - batch["loc"][:, :, 0]) / batch["scale"][:, :, 0]
+    assert not torch.isclose(noise[0], noise[1], atol=1e-3).any()
+
+
+def assert_each_push_is_in_the_next_batch(
+    collector: BaseCollector, policy: TensorDictSequential, batches: Iterator[TensorDictBase]
+) -> None:
+    for version in (1, 2):
+        action = decode_to(policy, 0.3 * version)
+        act_around(policy, version)
+        collector.update_policy_weights_()
+        batch = next(batches)
+        assert torch.allclose(batch["action"], action.expand_as(batch["action"]))
+        assert was_decoded_by(batch, policy)
+        assert (batch["loc"] == version).all()
+        assert origin(batch, "policy_version") == version
 
 
 def distinct_frames(batches: list[TensorDictBase]) -> int:

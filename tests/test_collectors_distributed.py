@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from tests.synergy_policy import (
-    act_around,
+    assert_each_push_is_in_the_next_batch,
+    assert_workers_differ,
     decode_to,
     distinct_frames,
     make_batched_env,
@@ -48,20 +49,8 @@ def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(
     batch = next(batches)
     assert batch.shape == (2, 2, 4)  # workers, environments, time
     assert was_decoded_by(batch, policy)
-    first, second = batch["observation"][:, :, 0]
-    assert not torch.isclose(first[:, :2], second[:, :2]).any()  # episodes begin elsewhere ...
-    noise = (batch["synergy"][:, :, 0].atanh() - batch["loc"][:, :, 0]) / batch["scale"][:, :, 0]
-    assert not torch.isclose(noise[0], noise[1], atol=1e-3).any()  # ... and explore otherwise
-
-    for version in (1, 2):
-        action = decode_to(policy, 0.3 * version)
-        act_around(policy, version)
-        collector.update_policy_weights_()
-        batch = next(batches)
-        assert torch.allclose(batch["action"], action.expand_as(batch["action"]))
-        assert was_decoded_by(batch, policy)
-        assert (batch["loc"] == version).all()
-        assert origin(batch, "policy_version") == version
+    assert_workers_differ(batch)
+    assert_each_push_is_in_the_next_batch(collector, policy, batches)
 
 
 def test_asynchronous_workers_take_turns_and_only_batches_under_way_have_older_weights(start):

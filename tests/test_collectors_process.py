@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -16,9 +17,10 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import RewardSum, TransformedEnv
 
 from tests.point_env import PointTask
+from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
-from torchrl_etl.modules import SynergyDecoder, make_actor
+from torchrl_etl.modules import make_actor
 
 FRAMES = 48
 
@@ -29,18 +31,12 @@ def make_overactuated() -> TransformedEnv:
 
 @pytest.fixture
 def policy() -> TensorDictSequential:
-    torch.manual_seed(0)
-    decoder = SynergyDecoder(2, 16, hidden=(16,))
-    actor = make_actor({"observation": 6}, decoder.synergy_spec, out_key="synergy", hidden=(32, 32))
-    return TensorDictSequential(actor, decoder)
+    return synergy_policy()
 
 
 def decodes_to(policy: TensorDictSequential, value: float) -> None:
-    """Lets the decoder give one action for any synergy."""
-    with torch.no_grad():
-        last = policy.module[1].module.decoder.mlp[-1]
-        last.weight.zero_()
-        last.bias.fill_(torch.atanh(torch.tensor(value)))
+    """Lets the decoder give this action for any synergy."""
+    decode_to(policy, math.atanh(value))
 
 
 @pytest.fixture
@@ -168,9 +164,7 @@ LEARNER = """
 import time
 from tests.test_collectors_process import *
 if __name__ == "__main__":
-    decoder = SynergyDecoder(2, 16, hidden=(16,))
-    actor = make_actor({"observation": 6}, decoder.synergy_spec, out_key="synergy", hidden=(8,))
-    policy = TensorDictSequential(actor, decoder)
+    policy = synergy_policy()
     batches = make_batches("process", make_overactuated, policy, frames_per_batch=48, ahead=True)
     batches.next()
     print(batches._collector.procs[0].pid, flush=True)
