@@ -21,10 +21,10 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 import torch
-from harness import interleave, line
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from harness import interleave, line, synergy_policy
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import MultiSyncCollector
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import RewardSum, TransformedEnv
 
 from torchrl_etl.collectors import Batches, VectorCollector, make_batches
 from torchrl_etl.command_line import quiet_torchrl
@@ -38,24 +38,23 @@ TASKS = ("myoHandPenTwirl", "myoLegWalk", "dog-run")
 DIM = 4
 
 
-def stage_env(task: str, stage: str, decoder: SynergyDecoder, num_envs: int) -> EnvBase:
-    env = TransformedEnv(make_env(task, num_envs=num_envs, device="cpu"), RewardSum())
+def recipe_env(task: str, num_envs: int) -> TransformedEnv:
+    return TransformedEnv(make_env(task, num_envs=num_envs, device="cpu"), RewardSum())
+
+
+def stage_env(task: str, stage: str, decoder: SynergyDecoder, num_envs: int) -> TransformedEnv:
+    env = recipe_env(task, num_envs)
     if stage == "explore":
         return env.append_transform(DirectionPrimer(DIM))
     return env.append_transform(SynergyAction(decoder))
 
 
-def stage_policy(task: str, stage: str) -> tuple[TensorDictModuleBase, SynergyDecoder]:
+def explore_policy(task: str) -> TensorDictModuleBase:
     env = make_env(task)
     spec = env.full_action_spec_unbatched["action"]
-    inputs = {"observation": env.observation_spec["observation"].shape[-1]}
+    inputs = {"observation": env.observation_spec["observation"].shape[-1], "direction": DIM}
     env.close()
-    decoder = SynergyDecoder(
-        DIM, spec.shape[-1], low=spec.space.low.tolist(), high=spec.space.high.tolist()
-    )
-    if stage == "explore":
-        return make_actor({**inputs, "direction": DIM}, spec), decoder
-    return make_actor(inputs, decoder.synergy_spec, out_key="synergy"), decoder
+    return make_actor(inputs, spec)
 
 
 def bare_simulator(task: str, actions: np.ndarray, pipe: Connection) -> None:
@@ -106,7 +105,9 @@ def frames_per_second(next_batch: Callable[[], object], frames: int, per_batch: 
 
 
 def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
-    policy, decoder = stage_policy(task, stage)
+    synergetic = synergy_policy(task, DIM)
+    actor, decoder = synergetic[0], synergetic[1]
+    policy = explore_policy(task) if stage == "explore" else actor
     workers, num_envs = arguments.workers, arguments.num_envs
     env = partial(stage_env, task, stage, decoder)
     example = VectorCollector(partial(env, 2), policy, frames_per_batch=400, total_frames=-1)
@@ -115,10 +116,10 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
     actions = batch[executed][0].numpy().copy()
     example.shutdown()
 
-    acting = policy if stage == "explore" else TensorDictSequential(policy, decoder)
-    make = partial(env, num_envs)
-    if stage == "learn":  # as in the recipes: the decoder acts as a part of the policy
-        make = partial(recipe_env, task, num_envs)
+    if stage == "explore":
+        acting, make = policy, partial(env, num_envs)
+    else:  # as in the recipes: the decoder acts as a part of the policy
+        acting, make = synergetic, partial(recipe_env, task, num_envs)
     per_batch = workers * num_envs * arguments.steps
     batches: Batches = make_batches(
         "process",
@@ -163,10 +164,6 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
     bare.close()
     for scheme in stock._weight_sync_schemes.values():  # else its __del__ hangs at exit
         scheme.shutdown()
-
-
-def recipe_env(task: str, num_envs: int) -> EnvBase:
-    return TransformedEnv(make_env(task, num_envs=num_envs, device="cpu"), RewardSum())
 
 
 def main() -> None:

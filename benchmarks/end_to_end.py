@@ -16,7 +16,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from harness import interleave, line
+from harness import Child, interleave, line
 
 from torchrl_etl.envs.tasks import resolve_task
 
@@ -25,31 +25,15 @@ OURS = ("etl_learn", "etl_explore", "sac")
 FRAMES = {1: 256, 16: 2048}  # of one measurement, by frames per update
 
 
-class Contender:
+class Contender(Child):
     """A process that trains for as many frames as it is told."""
-
-    def __init__(self, command: list[str]) -> None:
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self.process = subprocess.Popen(command, stderr=subprocess.DEVNULL, **pipes)
-
-    def answer(self) -> str:
-        line = self.process.stdout.readline().strip()
-        if not line:
-            raise RuntimeError(f"{self.process.args} ended with {self.process.wait()}.")
-        return line
 
     def await_ready(self) -> None:
         while self.answer() != "ready":
             pass
 
     def frames_per_second(self, frames: int) -> float:
-        self.process.stdin.write(f"{frames}\n")
-        self.process.stdin.flush()
-        return frames / float(self.answer())
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait()
+        return frames / float(self.ask(frames))
 
 
 def compare(task: str, frames_per_update: int, arguments: argparse.Namespace) -> None:
@@ -61,7 +45,9 @@ def compare(task: str, frames_per_update: int, arguments: argparse.Namespace) ->
     if arguments.peer:
         peer = [arguments.peer, str(HERE / "peer_sb3_training.py")]
         commands["stable_baselines3"] = [*peer, "--env", resolve_task(task).env_id, *common]
-    contenders = {name: Contender(command) for name, command in commands.items()}
+    contenders = {
+        name: Contender(command, stderr=subprocess.DEVNULL) for name, command in commands.items()
+    }
     for contender in contenders.values():
         contender.await_ready()
     frames = FRAMES[frames_per_update]

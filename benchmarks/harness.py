@@ -1,15 +1,67 @@
-"""What the benchmarks share: cases that take turns, and one JSON line for each."""
+"""What the benchmarks share: the recipe's sizes, cases that take turns, a JSON line for each."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictSequential
+
+from torchrl_etl.envs import make_env
+from torchrl_etl.modules import SynergyDecoder, make_actor
 from torchrl_etl.training.run_folder import facts
 
-__all__ = ["interleave", "line", "spread"]
+__all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy"]
+
+CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
+
+
+def recipe(*overrides: str) -> DictConfig:
+    """The configuration of ``recipes/etl_sac.py`` with these overrides."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
+    """The learn stage's policy, actor and decoder, at the sizes of the recipe."""
+    env = make_env(task)
+    bounds = env.full_action_spec_unbatched["action"]
+    inputs = {"observation": env.observation_spec["observation"].shape[-1]}
+    env.close()
+    decoder = SynergyDecoder(
+        num_synergies, bounds.shape[-1], low=bounds.space.low, high=bounds.space.high
+    )
+    actor = make_actor(inputs, decoder.synergy_spec, out_key="synergy")
+    return TensorDictSequential(actor, decoder)
+
+
+class Child:
+    """A process that answers each line that it is sent with a line."""
+
+    def __init__(self, command: Sequence[str | Path], **options: Any) -> None:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen(command, **pipes, **options)
+
+    def answer(self) -> str:
+        line = self.process.stdout.readline().strip()
+        if not line:
+            raise RuntimeError(f"{self.process.args} ended with {self.process.wait()}.")
+        return line
+
+    def ask(self, line: object) -> str:
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+        return self.answer()
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait()
 
 
 def interleave(cases: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:

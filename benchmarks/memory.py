@@ -17,14 +17,10 @@ import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness import line
-from hydra import compose, initialize_config_dir
+from harness import line, recipe
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Experiment
-
-CONF = Path(__file__).parent.parent / "recipes" / "conf"
 
 
 def resident_gigabytes() -> dict[str, float]:
@@ -49,11 +45,8 @@ def measure(arguments: argparse.Namespace, folder: str) -> None:
         f"learn.buffer_storage={arguments.storage}",
         f"learn.frames={arguments.transitions}",
     ]
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        experiment = Experiment(compose("config", overrides=overrides))
-    space = experiment.spec.full_action_spec_unbatched["action"].space
-    decoder = SynergyDecoder(4, len(experiment.actuators), low=space.low, high=space.high)
-    stage = experiment.learn_stage(decoder)
+    experiment = Experiment(recipe(*overrides))
+    stage = experiment.learn_stage(experiment.blank_decoder())
     stage.restart_collection()
     rows = stage.transitions(stage.collect())
     copies = rows.expand(100, *rows.shape).reshape(-1)

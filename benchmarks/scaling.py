@@ -21,13 +21,12 @@ from pathlib import Path
 from statistics import median
 
 import torch
-from tensordict.nn import TensorDictSequential
+from harness import synergy_policy
 
 from torchrl_etl.collectors import VectorCollector, make_batches
 from torchrl_etl.collectors.remote import weights_of
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.envs import make_env
-from torchrl_etl.modules import SynergyDecoder, make_actor
 from torchrl_etl.training.run_folder import facts
 
 ROOT = Path(__file__).parent.parent
@@ -35,23 +34,6 @@ KINDS = ("process", "async", "ray", "distributed")
 ORIGIN = ("commit", "machine", "torch", "torchrl", "mujoco", "myosuite")
 KEPT = ("observation", "synergy", "action")
 KEPT_NEXT = ("observation", "reward", "done", "terminated")
-
-
-def synergy_policy(env_name: str, num_synergies: int) -> TensorDictSequential:
-    """The learn stage's policy, at the sizes of recipes/conf/config.yaml."""
-    env = make_env(env_name)
-    bounds = env.full_action_spec_unbatched["action"]
-    decoder = SynergyDecoder(
-        num_synergies,
-        bounds.shape[-1],
-        low=bounds.space.low.tolist(),
-        high=bounds.space.high.tolist(),
-    )
-    inputs = {"observation": env.observation_spec["observation"].shape[-1]}
-    env.close()
-    return TensorDictSequential(
-        make_actor(inputs, decoder.synergy_spec, out_key="synergy"), decoder
-    )
 
 
 def cpu_seconds() -> tuple[float, float]:

@@ -8,20 +8,17 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
+from harness import recipe
 from tensordict import TensorDictBase
-from torch import Tensor, optim
+from torch import Tensor
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.training import Experiment
-from torchrl_etl.training.stage import Stage, ready_for_training
-
-CONF = Path(__file__).parent.parent / "recipes" / "conf"
+from torchrl_etl.training.stage import Stage, make_optimizer, ready_for_training
 
 
 class SACStage(Stage):
@@ -37,7 +34,7 @@ class SACStage(Stage):
         super().__init__(make_env, actor, **stage)
         self.sac = LeanSACLoss(actor, critic, action_spec=action_spec, alpha_init=sac["alpha_init"])
         self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
-        self.optimizer = optim.Adam(self.sac.parameters(), lr=sac["lr"], fused=True)
+        self.optimizer = make_optimizer(self.device, (self.sac.parameters(), sac["lr"]))
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = batch.select("observation", "action", ("next", "observation"))
@@ -56,10 +53,8 @@ class SACStage(Stage):
 def build(experiment: Experiment, method: str) -> Stage:
     if method == "etl_explore":
         return experiment.explore_stage()
-    space = experiment.spec.full_action_spec_unbatched["action"].space
-    decoder = SynergyDecoder(4, len(experiment.actuators), low=space.low, high=space.high)
     if method == "etl_learn":
-        return experiment.learn_stage(decoder)
+        return experiment.learn_stage(experiment.blank_decoder())
     options = experiment._options("learn")
     for name in ("fine_tuning", "decoder_lr", "anchor"):
         options.pop(name)
@@ -86,8 +81,7 @@ def main() -> None:
         f"learn.updates_per_frame={updates}",
         *arguments.overrides,
     ]
-    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        experiment = Experiment(compose("config", overrides=overrides))
+    experiment = Experiment(recipe(*overrides))
     stage = build(experiment, arguments.method)
     stage.restart_collection()
 

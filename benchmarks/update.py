@@ -22,7 +22,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is there
 
 import platform
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -30,14 +29,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import interleave, line
-from hydra import compose, initialize_config_dir
+from harness import Child, interleave, line, recipe
 from tensordict import TensorDict
 from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.training import Experiment
 from torchrl_etl.training.compiled import compiled
@@ -53,20 +51,13 @@ Shape = tuple[int, int, int]
 def config(env: str, compile: bool, layer_norm: bool) -> Any:
     overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compile).lower()}"]
     overrides += [f"network.layer_norm={str(layer_norm).lower()}"]
-    with initialize_config_dir(str(ROOT / "recipes" / "conf"), version_base="1.3"):
-        return compose("config", overrides=overrides)
+    return recipe(*overrides)
 
 
 def stages(env: str, compile: bool, layer_norm: bool) -> tuple[Stage, Stage]:
     """Both stages as the recipe builds them, their buffers filled."""
     experiment = Experiment(config(env, compile, layer_norm))
-    space = experiment.spec.full_action_spec_unbatched["action"].space
-    decoder = SynergyDecoder(
-        experiment.config.num_synergies,
-        len(experiment.actuators),
-        low=space.low.tolist(),
-        high=space.high.tolist(),
-    )
+    decoder = experiment.blank_decoder()
     both = experiment.explore_stage(), experiment.learn_stage(decoder)
     sizes = experiment.spec.observation_spec["observation"].shape[-1], decoder.action_dim
     for stage in both:
@@ -193,27 +184,17 @@ def plain_sac(cfg: Any, stage: Stage, library: str) -> Callable[[], object]:
     return run
 
 
-class Peer:
+class Peer(Child):
     """Stable-Baselines3 in its own process and environment."""
 
     def __init__(self, case: dict[str, Any]) -> None:
-        self.process = subprocess.Popen(
-            [PEER, ROOT / "benchmarks" / "peer_sb3.py", json.dumps(case)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        self.versions = json.loads(self.process.stdout.readline())
+        script = ROOT / "benchmarks" / "peer_sb3.py"
+        env = {**os.environ, "OMP_NUM_THREADS": "1"}
+        super().__init__([PEER, script, json.dumps(case)], env=env)
+        self.versions = json.loads(self.answer())
 
     def block(self, updates: int) -> float:
-        self.process.stdin.write(f"{updates}\n")
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())["ms"]
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait()
+        return json.loads(self.ask(updates))["ms"]
 
 
 def cpu_model() -> str:
