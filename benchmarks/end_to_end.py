@@ -4,8 +4,10 @@
     python benchmarks/end_to_end.py --peer .venv-peers/bin/python --repeats 5
 
 The same task, networks (two layers of 256, no layer norm), batch (256) and updates a frame, in
-processes that take turns: while one is measured, the others wait. Ours collect in a worker process
-while the learner learns; Stable-Baselines3 does both in turn, as it is built to.
+processes that take turns: while one is measured, the others wait. Ours run compiled (``_eager``:
+not), in the layout that suits two cores: where updates prevail the learner takes both cores and
+collects in between; where frames prevail a worker collects while it learns. Stable-Baselines3
+collects and learns in turn, on both cores, as it is built to.
 """
 
 from __future__ import annotations
@@ -21,8 +23,15 @@ from harness import Child, interleave, line
 from torchrl_etl.envs.tasks import resolve_task
 
 HERE = Path(__file__).parent
-OURS = ("etl_learn", "etl_explore", "sac")
-FRAMES = {1: 256, 16: 2048}  # of one measurement, by frames per update
+OURS = {
+    "etl_learn": ("etl_learn", "compile=true"),
+    "etl_learn_eager": ("etl_learn", "compile=false"),
+    "etl_explore": ("etl_explore", "compile=true"),
+    "sac": ("sac", "compile=true"),
+}
+# By frames per update: the frames of one measurement, and where ours collect.
+FRAMES = {1: 512, 16: 4096}
+COLLECTORS = {1: "collector=single", 16: "collector=process"}
 
 
 class Contender(Child):
@@ -38,10 +47,12 @@ class Contender(Child):
 
 def compare(task: str, frames_per_update: int, arguments: argparse.Namespace) -> None:
     common = ["--frames-per-update", str(frames_per_update)]
-    commands = {
-        name: [sys.executable, str(HERE / "training.py"), "--method", name, "--env", task, *common]
-        for name in arguments.methods
-    }
+    ours = [sys.executable, str(HERE / "training.py"), "--env", task, *common]
+    commands = {}
+    for name in arguments.methods:
+        method, *overrides = OURS[name]
+        collector = COLLECTORS[frames_per_update]
+        commands[name] = [*ours, "--method", method, collector, *overrides]
     if arguments.peer:
         peer = [arguments.peer, str(HERE / "peer_sb3_training.py")]
         commands["stable_baselines3"] = [*peer, "--env", resolve_task(task).env_id, *common]
@@ -71,7 +82,7 @@ def compare(task: str, frames_per_update: int, arguments: argparse.Namespace) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="myoHandPenTwirl")
-    parser.add_argument("--methods", nargs="*", choices=OURS, default=OURS)
+    parser.add_argument("--methods", nargs="*", choices=OURS, default=list(OURS))
     parser.add_argument("--frames-per-update", nargs="+", type=int, default=(1, 16), choices=FRAMES)
     parser.add_argument("--peer", help="Python with stable-baselines3; see `make bench`")
     parser.add_argument("--repeats", type=int, default=4)

@@ -75,7 +75,6 @@ def main() -> None:
     overrides = [
         f"env={arguments.env}",
         "run_dir=unused",
-        "collector=process",
         "network.layer_norm=false",
         f"explore.updates_per_frame={updates}",
         f"learn.updates_per_frame={updates}",
