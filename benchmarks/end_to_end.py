@@ -30,7 +30,7 @@ OURS = {
     "sac": ("sac", "compile=true"),
 }
 # By frames per update: the frames of one measurement, and where ours collect.
-FRAMES = {1: 512, 16: 4096}
+FRAMES = {1: 256, 16: 2048}
 COLLECTORS = {1: "collector=single", 16: "collector=process"}
 
 
@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", choices=OURS, default=list(OURS))
     parser.add_argument("--frames-per-update", nargs="+", type=int, default=(1, 16), choices=FRAMES)
     parser.add_argument("--peer", help="Python with stable-baselines3; see `make bench`")
-    parser.add_argument("--repeats", type=int, default=4)
+    parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     for frames_per_update in arguments.frames_per_update:
         compare(arguments.env, frames_per_update, arguments)

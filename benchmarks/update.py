@@ -50,7 +50,7 @@ Shape = tuple[int, int, int]
 
 def config(env: str, compile: bool, layer_norm: bool) -> Any:
     overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compile).lower()}"]
-    overrides += [f"network.layer_norm={str(layer_norm).lower()}"]
+    overrides += [f"actor.layer_norm={str(layer_norm).lower()}"]
     return recipe(*overrides)
 
 
@@ -119,7 +119,7 @@ def sac_products(batch: int, inputs: int, action: int, out: int, hidden: list[in
 
 
 def stage_products(cfg: Any, name: str, observation_dim: int, action_dim: int) -> list[Shape]:
-    d, batch, hidden = cfg.num_synergies, cfg[name].batch_size, list(cfg.network.hidden)
+    d, batch, hidden = cfg.num_synergies, cfg[name].batch_size, list(cfg.actor.hidden)
     body = list(cfg.explore.gmvae.hidden)
     decoder = [d, *reversed(body), action_dim]
     if name == "learn":
@@ -152,7 +152,7 @@ def plain_sac(cfg: Any, stage: Stage, library: str) -> Callable[[], object]:
     kept = stage.buffer.storage[:].select("observation", "action", "next")
     sizes = {key: kept[key].shape[-1] for key in ("observation", "action")}
     spec = Bounded(-1, 1, shape=(sizes["action"],))
-    network = {"hidden": list(cfg.network.hidden), "layer_norm": cfg.network.layer_norm}
+    network = {"hidden": list(cfg.actor.hidden), "layer_norm": cfg.actor.layer_norm}
     actor = make_actor({"observation": sizes["observation"]}, spec, **network)
     kind = SACLoss if library == "torchrl" else LeanSACLoss
     loss = kind(actor, make_critic(sizes, **network), action_spec=spec)
@@ -221,7 +221,7 @@ def main() -> None:
     explore, learn = stages(arguments.env, False, arguments.layer_norm)
     example = learn.buffer.storage[:2]
     sizes = example["observation"].shape[-1], example["action"].shape[-1]
-    batch, hidden = cfg.learn.batch_size, list(cfg.network.hidden)
+    batch, hidden = cfg.learn.batch_size, list(cfg.actor.hidden)
 
     def timed(update: Callable[[], object]) -> Callable[[], float]:
         def block() -> float:

@@ -52,14 +52,14 @@ def main(config: DictConfig) -> None:
 
 def report(summary: dict[str, Any], folder: Path) -> str:
     """What a person wants to know at the end of a run."""
-    synergies, learned = summary["synergies"], summary.get("learn", {})
-    lines = [
-        "",
-        f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}",
-        f"  {'synergies':<12}variance accounted for {synergies['vaf']:.3f} (PCA "
-        f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
-        f"control authority {synergies['control_authority']:.2f}",
-    ]
+    synergies, learned = summary.get("synergies"), summary.get("learn", {})
+    lines = ["", f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}"]
+    if synergies is not None:
+        lines.append(
+            f"  {'synergies':<12}variance accounted for {synergies['vaf']:.3f} (PCA "
+            f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
+            f"control authority {synergies['control_authority']:.2f}"
+        )
     for key in ("return", "solved", "solved_time"):
         if key in learned:
             value = learned[key]

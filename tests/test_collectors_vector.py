@@ -10,7 +10,9 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import (
+    Compose,
     ExplorationType,
+    InitTracker,
     RewardSum,
     StepCounter,
     TransformedEnv,
@@ -20,7 +22,7 @@ from torchrl.envs import (
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import make_env
-from torchrl_etl.modules import SynergyDecoder, make_actor
+from torchrl_etl.modules import HeldNoise, SynergyDecoder, make_actor
 from torchrl_etl.transforms import DirectionPrimer, SynergyAction
 
 PLAIN = {"trust_policy": True, "auto_register_policy_transforms": False}
@@ -94,6 +96,23 @@ def test_real_simulators_too(name):
         batches(VectorCollector, make, policy, frames=120),
         batches(Collector, make, policy, frames=120, **PLAIN),
     )
+
+
+def test_held_noise_is_the_same_under_both_and_begins_anew_with_every_episode():
+    _, policy = parts("overactuated", "policy")
+
+    def tracked():
+        return TransformedEnv(
+            make_env("overactuated", num_envs=3), Compose(RewardSum(), InitTracker())
+        )
+
+    held = TensorDictSequential(HeldNoise(policy[0]), policy[1])
+    ours = batches(VectorCollector, tracked, held)
+    held = TensorDictSequential(HeldNoise(policy[0]), policy[1])
+    assert_same(ours, batches(Collector, tracked, held, **PLAIN))
+    begins = torch.cat([batch["is_init"] for batch in ours], dim=1)
+    ends = torch.cat([batch["next", "done"] for batch in ours], dim=1)
+    assert begins[:, 0].all() and torch.equal(begins[:, 1:], ends[:, :-1]) and ends.any()
 
 
 def test_resets_of_single_environments_keep_the_others():

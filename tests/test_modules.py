@@ -361,6 +361,26 @@ def test_a_critic_is_a_perceptron_on_its_joined_inputs() -> None:
     torch.testing.assert_close(critic.module(*inputs), joined)
 
 
+def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
+    torch.manual_seed(0)
+    network = make_critic({"observation": 3}, body="residual", hidden=(4, 4)).module
+    first, one, two, norm, head = network
+    observation = torch.randn(6, 3)
+    hidden = first(observation)
+    for block in (one, two):
+        normed = nn.functional.layer_norm(hidden, (4,), block[0].weight, block[0].bias)
+        hidden = hidden + block[3](block[1](normed).relu())
+        assert block[1].out_features == 16
+    torch.testing.assert_close(network(observation), head(norm(hidden)))
+
+
+def test_a_residual_body_is_of_one_width_and_known_bodies_are_named() -> None:
+    with pytest.raises(ValueError, match=r"hidden is \[4, 8\].*one width"):
+        make_critic({"observation": 3}, body="residual", hidden=(4, 8))
+    with pytest.raises(ValueError, match=r"body is 'resnet'.*residual"):
+        make_critic({"observation": 3}, body="resnet")
+
+
 @pytest.mark.parametrize("action", ["action", "synergy", ("arm", "action")])
 def test_critic_writes_a_state_action_value_whatever_the_action_is_called(action: object) -> None:
     critic = make_critic({"observation": 3, action: 2}, hidden=(8,))

@@ -61,11 +61,15 @@ def test_every_task_of_the_paper_is_valid(task):
         ("explore.direction.kind=foo", "sphere"),
         ("explore.direction.num_directions=3 explore.direction.kind=orthonormal", "3"),
         ("explore.fit.actions=activation", "activation"),
-        ("network.hidden=[0]", "network.hidden is [0]; it must be a list of whole numbers"),
+        ("learn.critic.bins=51", "which needs a bound on returns"),
+        ("learn.sac.noise=hold", "choose one of independent, held"),
+        ("critic.body=resnet", "choose one of mlp, residual"),
+        ("frames=10", "frames is 10, of which 600 go into"),
+        ("actor.hidden=[0]", "actor.hidden is [0]; it must be a list of whole numbers"),
         ("vaf_curve.dims=3", "vaf_curve.dims is 3"),
         ("threads=-1", "threads is -1"),
         ("pictures=abc", "pictures is 'abc'; it must be true or false"),
-        ("compile=yes_please", "compile is 'yes_please'; it must be true or false"),
+        ("compile=yes_please", "compile is 'yes_please'; it must be true, false or null"),
         ("device=null", "device is None; it must be a text"),
         ("device=meta", "device is 'meta'; use cpu"),
         ("env=3", "env is 3; it must be a text"),
@@ -118,7 +122,7 @@ def test_resuming_what_is_no_run_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "override", ["experiment=quick", "network.hidden=[16]", "num_synergies=3", "env=myoHandPose"]
+    "override", ["experiment=quick", "actor.hidden=[16]", "num_synergies=3", "env=myoHandPose"]
 )
 def test_what_would_make_it_another_run_cannot_be_changed_on_resume(override, tmp_path):
     Experiment(tiny(f"run_dir='{tmp_path}/run'")).folder.open(resume=False)

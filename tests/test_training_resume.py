@@ -22,7 +22,7 @@ from torchrl_etl.training import Experiment, Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
 
-WALL_CLOCK = "frames_per_second"
+WALL_CLOCK = ("frames_per_second", "wall_seconds")
 
 
 def numbers(run: Path) -> dict[str, str]:
@@ -30,10 +30,10 @@ def numbers(run: Path) -> dict[str, str]:
     scalars = {
         path.relative_to(run).as_posix(): path.read_text()
         for path in sorted((run / "csv").rglob("*.csv"))
-        if path.stem != WALL_CLOCK
+        if path.stem not in WALL_CLOCK
     }
     summary = json.loads((run / "summary.json").read_text())
-    for section in (summary, summary["synergies"]):
+    for section in (summary, summary.get("synergies", {})):
         for key in ("versions", "commit"):
             section.pop(key, None)
     return {**scalars, "summary": json.dumps(summary)}
@@ -131,6 +131,31 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrup
         Experiment(resumed_config(run), resume=run).run()
     assert any(f"{newest} is damaged" in str(warning.message) for warning in caught)
     assert numbers(run) == uninterrupted
+
+
+def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numbers(
+    tmp_path, monkeypatch
+):
+    learner = (
+        *("method=sac", "actor.body=residual", "learn.critic.bins=11", "learn.sac.noise=held"),
+        *("learn.sac.return_bound=5", "learn.updates_per_frame=0.5", "frames=608"),
+    )
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    Experiment(tiny(f"run_dir='{whole}'", *learner)).run()
+
+    save = Checkpoints.save
+
+    def save_and_die(self, checkpoint, *, step, **kwargs):
+        save(self, checkpoint, step=step, **kwargs)
+        raise ZeroDivisionError("as good as killed")
+
+    monkeypatch.setattr(Checkpoints, "save", save_and_die)
+    with pytest.raises(ZeroDivisionError):
+        Experiment(tiny(f"run_dir='{broken}'", *learner)).run()
+    monkeypatch.undo()
+    summary = Experiment(resumed_config(broken), resume=broken).run()
+    assert "synergies" not in summary and summary["learn"]["frames_charged"] == 608
+    assert numbers(broken) == numbers(whole)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -41,6 +41,27 @@ def fill(stage, batches: int = 6) -> None:
         stage.collect()
 
 
+def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
+    settings = ("method=sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
+    stage = Experiment(tiny("run_dir=unused", *settings)).learn_stage(None)
+    stage.restart_collection()
+    fill(stage)
+    seen = {}
+    stage.sac.register_forward_pre_hook(
+        lambda _, args: seen.update(reward=args[0]["next", "reward"])
+    )
+    torch.manual_seed(0)
+    kept = stage.buffer.sample()["next", "reward"]
+    torch.manual_seed(0)
+    before = snapshot(stage.policy)
+    stage.update()
+    scale = stage.return_scale.scale.float()
+    assert scale != 1 and torch.allclose(seen["reward"], kept / scale)
+    assert changed(stage.policy, before)
+    assert stage.policy.out_keys[-1] == "action" and stage.action_spec.shape == (16,)
+    stage.close()
+
+
 def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
     stage = explore_stage()
     fill(stage)

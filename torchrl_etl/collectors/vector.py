@@ -14,7 +14,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, GymWrapper, RewardSum, TransformedEnv, set_exploration_type
+from torchrl.envs import (
+    EnvBase,
+    GymWrapper,
+    InitTracker,
+    RewardSum,
+    TransformedEnv,
+    set_exploration_type,
+)
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.collectors.policy_on_arrays import Arrays, PolicyOnArrays
@@ -22,12 +29,15 @@ from torchrl_etl.transforms import DirectionPrimer, SynergyAction
 
 __all__ = ["VectorCollector"]
 
+_KNOWN = (RewardSum, InitTracker, DirectionPrimer, SynergyAction)
+
 
 class VectorCollector(Collector):
     """TorchRL's ``Collector``, several times cheaper per step on vectorised Gymnasium tasks.
 
     The environment is an ordinary one: :func:`~torchrl_etl.envs.make_env` with ``num_envs`` above
-    one, under any of ``RewardSum``, :class:`~torchrl_etl.transforms.DirectionPrimer` and
+    one, under any of ``RewardSum``, ``InitTracker``,
+    :class:`~torchrl_etl.transforms.DirectionPrimer` and
     :class:`~torchrl_etl.transforms.SynergyAction`. TorchRL steps it through specs, clones and
     containers that cost more than a hand's physics; this rollout does the same arithmetic on
     arrays and fills one tensordict at the end. Transitions are bit by bit those of ``Collector``.
@@ -73,6 +83,7 @@ class VectorCollector(Collector):
         super().__init__(create_env_fn, policy, **kwargs)
         self._simulators, known = _take_apart(self.env)
         self._reward_sum: RewardSum | None = known.get(RewardSum)
+        self._init_tracker: InitTracker | None = known.get(InitTracker)
         self._primer: DirectionPrimer | None = known.get(DirectionPrimer)
         self._synergy_action: SynergyAction | None = known.get(SynergyAction)
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
@@ -148,6 +159,8 @@ class VectorCollector(Collector):
         if self._reward_sum is not None:
             key = self._reward_sum.out_keys[0]
             after[key] = now[key] + after["reward"]
+        if self._init_tracker is not None:
+            after[self._init_tracker.out_keys[0]] = np.zeros_like(after["done"])
         if self._primer is not None:
             key = self._primer.out_keys[0]
             after[key] = now[key]
@@ -161,6 +174,8 @@ class VectorCollector(Collector):
         if self._reward_sum is not None:
             key = self._reward_sum.out_keys[0]
             fresh[key] = np.where(done[:, None], np.float32(0), now[key])
+        if self._init_tracker is not None:
+            fresh[self._init_tracker.out_keys[0]] = done[:, None]
         if self._primer is not None:
             key = self._primer.out_keys[0]
             drawn = self._primer.draw(self.env.batch_size).numpy()  # for all, as in a plain reset
@@ -185,12 +200,12 @@ def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, dict[type[Transform], Tran
     while isinstance(env, TransformedEnv):
         transforms += list(getattr(env.transform, "transforms", [env.transform]))
         env = env.base_env
-    foreign = [t for t in transforms if type(t) not in (RewardSum, DirectionPrimer, SynergyAction)]
+    foreign = [transform for transform in transforms if type(transform) not in _KNOWN]
     if foreign or not isinstance(env, GymWrapper) or not isinstance(env._env, SyncVectorEnv):
         what = type(foreign[0]).__name__ if foreign else f"{type(env).__name__} of one simulator"
         raise ValueError(
-            f"VectorCollector knows make_env(..., num_envs=2 or more) under RewardSum, "
-            f"DirectionPrimer and SynergyAction, but the environment has a {what}; use "
+            "VectorCollector knows make_env(..., num_envs=2 or more) under "
+            f"{', '.join(kind.__name__ for kind in _KNOWN)}, but the environment has a {what}; use "
             "torchrl.collectors.Collector for it."
         )
     return env._env, {type(transform): transform for transform in transforms}

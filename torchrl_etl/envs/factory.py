@@ -35,6 +35,7 @@ def make_env(
     seed: int | None = None,
     device: torch.device | str | None = None,
     activations: bool = False,
+    muscle_lengths: bool = False,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """Builds a task as a TorchRL environment.
@@ -61,6 +62,8 @@ def make_env(
         device (torch.device, optional): where the tensors go; simulation stays on the CPU.
         activations (bool): adds ``activation``, the muscle activations in units of the
             action (MyoSuite only). Defaults to ``False``.
+        muscle_lengths (bool): adds ``muscle_length``, the lengths of muscles with their tendons in
+            metres (MyoSuite only). Defaults to ``False``.
         env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
             ``dm_control.suite.load``.
 
@@ -74,7 +77,8 @@ def make_env(
         - ``reward`` [1]; ``done``, ``terminated``, ``truncated`` [1]. Time limits truncate.
         - ``solved`` [1], bool, where the task defines it: whether this very step meets the task's
           criterion. ``False`` at reset.
-        - ``activation`` [n], if asked for.
+        - ``activation`` [n], ``muscle_length`` [n], float32, in the order of the action, if asked
+          for.
 
     Raises:
         ValueError: for an unknown name, a goal that the task lacks, or actions that are not
@@ -93,7 +97,13 @@ def make_env(
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer, got {num_envs!r}.")
     task = resolve_task(name, goal)
-    build = partial(_build, task, activations=activations, env_kwargs=dict(env_kwargs or {}))
+    build = partial(
+        _build,
+        task,
+        activations=activations,
+        muscle_lengths=muscle_lengths,
+        env_kwargs=dict(env_kwargs or {}),
+    )
     with quiet_compiler():
         if num_envs == 1:
             env = GymWrapper(build(), device=device)
@@ -164,7 +174,9 @@ def _raw_actuator_names(simulation: Any) -> list[str]:
     return [model.actuator(i).name for i in range(model.nu)]
 
 
-def _build(task: Task, *, activations: bool, env_kwargs: dict[str, Any]) -> gym.Env:
+def _build(
+    task: Task, *, activations: bool, muscle_lengths: bool, env_kwargs: dict[str, Any]
+) -> gym.Env:
     env, faults = _simulator(task, env_kwargs)
     if not isinstance(env.action_space, spaces.Box):
         space = env.action_space
@@ -182,7 +194,9 @@ def _build(task: Task, *, activations: bool, env_kwargs: dict[str, Any]) -> gym.
     elif not isinstance(space, spaces.Box) or len(space.shape) != 1:
         env = FlattenObservation(env)
     env = FiniteGuard(env, task.name, faults)
-    return NamedObservation(env, success_key, activations=activations)
+    return NamedObservation(
+        env, success_key, activations=activations, muscle_lengths=muscle_lengths
+    )
 
 
 def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:

@@ -119,7 +119,7 @@ class FiniteGuard(gym.Wrapper):
 
 
 class NamedObservation(gym.Wrapper):
-    """Turns an array observation into ``{"observation": ..., "solved": ..., "activation": ...}``.
+    """Names the parts of an observation: ``observation``, ``solved``, and what muscles tell.
 
     ``info`` is dropped: MyoSuite's nested dicts are slow to batch, and nothing downstream reads it.
 
@@ -129,6 +129,9 @@ class NamedObservation(gym.Wrapper):
             shape [1] that is ``False`` at reset. ``None`` means that there is no such entry.
         activations (bool): whether to add ``activation``, the muscle activations in the units of
             the action, shape [n] (MyoSuite tasks only).
+        muscle_lengths (bool): whether to add ``muscle_length``, MuJoCo's ``actuator_length`` in the
+            order of the action, shape [n] (MyoSuite tasks only). That is the length of muscle and
+            tendon together, in metres.
 
     Equation:
         MyoSuite's hand and arm tasks excite a muscle by :math:`u = \\sigma(5(a - 1/2))`, so an
@@ -137,19 +140,31 @@ class NamedObservation(gym.Wrapper):
         :math:`a = x`.
 
     Raises:
-        ValueError: when ``activations`` is asked of an environment without muscles.
+        ValueError: when ``activations`` or ``muscle_lengths`` is asked of an environment without
+            muscles.
     """
 
-    def __init__(self, env: gym.Env, success_key: str | None = None, *, activations: bool = False):
+    def __init__(
+        self,
+        env: gym.Env,
+        success_key: str | None = None,
+        *,
+        activations: bool = False,
+        muscle_lengths: bool = False,
+    ):
         super().__init__(env)
         self._success_key = success_key
-        self._activations = activations
+        self._activations, self._muscle_lengths = activations, muscle_lengths
         entries: dict[str, spaces.Space] = {"observation": env.observation_space}
         if success_key is not None:
             entries["solved"] = spaces.Box(0, 1, (1,), np.bool_)
         if activations:
             self._sigmoid = _sends_sigmoid(env)
             entries["activation"] = env.action_space
+        if muscle_lengths:
+            _check_muscles(env, "muscle_lengths")
+            shape = env.action_space.shape
+            entries["muscle_length"] = spaces.Box(-np.inf, np.inf, shape, np.float32)
         self.observation_space = spaces.Dict(entries)
 
     def reset(self, **kwargs: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -167,6 +182,8 @@ class NamedObservation(gym.Wrapper):
             parts["solved"] = np.array([solved])
         if self._activations:
             parts["activation"] = self._activation()
+        if self._muscle_lengths:
+            parts["muscle_length"] = self.unwrapped.data.actuator_length.astype(np.float32)
         return parts
 
     def _activation(self) -> np.ndarray:
@@ -221,11 +238,16 @@ def _as_float32(space: spaces.Box) -> spaces.Box:
 
 def _sends_sigmoid(env: gym.Env) -> bool:
     """Whether the environment maps actions to muscle excitations through MyoSuite's sigmoid."""
+    _check_muscles(env, "activations")
     simulation, bounds = env.unwrapped, env.action_space
+    return bool(simulation.normalize_act and np.all(bounds.low == -1) and np.all(bounds.high == 1))
+
+
+def _check_muscles(env: gym.Env, option: str) -> None:
+    simulation = env.unwrapped
     model = getattr(simulation, "model", None)
     if not hasattr(simulation, "normalize_act") or model is None or model.na != model.nu:
         raise ValueError(
-            f"activations=True needs a MyoSuite task all of whose actuators are muscles, "
+            f"{option}=True needs a MyoSuite task all of whose actuators are muscles, "
             f"got {simulation}; leave it out."
         )
-    return bool(simulation.normalize_act and np.all(bounds.low == -1) and np.all(bounds.high == 1))

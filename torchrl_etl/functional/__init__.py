@@ -1,4 +1,4 @@
-"""Equations 1-10 of Explore to Learn as pure tensor functions.
+"""Equations 1-10 of Explore to Learn, and what else is mathematics, as pure tensor functions.
 
 No keys, no modules, no state: tensors in, tensors out. Every function works on any number of
 leading batch dimensions (written ``*``), and none of them reduces over the batch: that is left to
@@ -6,6 +6,11 @@ the caller. Symbols: ``n`` actuators, ``d`` synergies, ``k`` embedding dimension
 components.
 """
 
+from torchrl_etl.functional.categorical import (
+    categorical_cross_entropy,
+    categorical_mean,
+    project_categorical,
+)
 from torchrl_etl.functional.metric import (
     direction_bonus,
     discriminability,
@@ -30,7 +35,9 @@ from torchrl_etl.functional.synergy import (
 
 __all__ = [
     "GMVAEBound",
+    "categorical_cross_entropy",
     "categorical_kl",
+    "categorical_mean",
     "direction_bonus",
     "discriminability",
     "effective_rank",
@@ -45,5 +52,6 @@ __all__ = [
     "metric_target",
     "mico_distance",
     "mixture_log_prob",
+    "project_categorical",
     "reconstruction_loss",
 ]

@@ -2,6 +2,8 @@
 
 from torchrl_etl.modules.actor_critic import make_actor, make_critic
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder, Posterior
+from torchrl_etl.modules.held_noise import HeldNoise
+from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 
@@ -9,7 +11,9 @@ __all__ = [
     "GMVAE",
     "ActionDecoder",
     "GaussianDynamics",
+    "HeldNoise",
     "Posterior",
+    "ReturnScale",
     "StateEncoder",
     "SynergyDecoder",
     "make_actor",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
@@ -11,11 +12,16 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
-__all__ = ["make_actor", "make_critic"]
+from torchrl_etl.modules.checks import check_choice
+
+__all__ = ["Body", "make_actor", "make_critic", "make_layers"]
 
 
-class _Body(MLP):
-    """A perceptron on several inputs that are never joined.
+Body = Literal["mlp", "residual"]
+
+
+class _Layers(nn.Sequential):
+    """Layers whose first, a linear one, reads several inputs that are never joined.
 
     Hence no gradient is computed for an input that needs none: under the actor loss the critics'
     inputs are the action, whose gradient is wanted, and the observation, whose is not.
@@ -32,8 +38,34 @@ class _Body(MLP):
         return hidden
 
 
-def _body(in_features: int, out_features: int, hidden: Sequence[int], layer_norm: bool) -> MLP:
-    return _Body(
+class _ResidualBlock(nn.Sequential):
+    """x + W₂ relu(W₁ norm(x)), four times as wide inside (Lee 2024, SimBa)."""
+
+    def __init__(self, width: int, layer_norm: bool) -> None:
+        norm = [nn.LayerNorm(width)] if layer_norm else []
+        super().__init__(*norm, nn.Linear(width, 4 * width), nn.ReLU(), nn.Linear(4 * width, width))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return hidden + super().forward(hidden)
+
+
+def make_layers(
+    in_features: int, out_features: int, body: Body, hidden: Sequence[int], layer_norm: bool
+) -> nn.Sequential:
+    """The layers of an actor or a critic; called with as many tensors as it has inputs."""
+    check_choice("body", body, get_args(Body))
+    if body == "residual":
+        if len(set(hidden)) != 1:
+            raise ValueError(
+                f"hidden is {list(hidden)}; a residual body adds each block to the one before, so "
+                "its blocks must be of one width, such as [64, 64] for two of them."
+            )
+        width = hidden[0]
+        blocks = [_ResidualBlock(width, layer_norm) for _ in hidden]
+        norm = [nn.LayerNorm(width)] if layer_norm else []
+        head = nn.Linear(width, out_features)
+        return _Layers(nn.Linear(in_features, width), *blocks, *norm, head)
+    mlp = MLP(
         in_features,
         out_features,
         num_cells=list(hidden),
@@ -41,6 +73,7 @@ def _body(in_features: int, out_features: int, hidden: Sequence[int], layer_norm
         norm_class=nn.LayerNorm if layer_norm else None,
         norm_kwargs=[{"normalized_shape": width} for width in hidden] if layer_norm else None,
     )
+    return _Layers(*mlp)
 
 
 def make_actor(
@@ -48,6 +81,7 @@ def make_actor(
     action_spec: TensorSpec,
     *,
     out_key: NestedKey = "action",
+    body: Body = "mlp",
     hidden: Sequence[int] = (256, 256),
     layer_norm: bool = True,
 ) -> ProbabilisticActor:
@@ -60,8 +94,9 @@ def make_actor(
 
     Keyword Args:
         out_key (NestedKey): where the sample goes. Default: ``"action"``.
-        hidden (sequence of int): widths of the hidden layers.
-        layer_norm (bool): normalise each hidden layer.
+        body (str): ``"mlp"``, or ``"residual"``: blocks that each add to what came before.
+        hidden (sequence of int): widths of the hidden layers, or of the residual blocks.
+        layer_norm (bool): normalise each hidden layer, or what enters each block.
 
     Keys:
         reads ``inputs``; writes ``loc``, ``scale`` [*, n] (before the tanh) and ``out_key`` [*, n].
@@ -76,15 +111,15 @@ def make_actor(
         >>> action.shape, bool((action >= 0).all())
         (torch.Size([3, 80]), True)
     """
-    body = _body(sum(inputs.values()), 2 * action_spec.shape[-1], hidden, layer_norm)
+    layers = make_layers(sum(inputs.values()), 2 * action_spec.shape[-1], body, hidden, layer_norm)
     # The means start near the middle of the bounds, so that whatever they later vary in was
     # learned: in stage 1 the GMVAE would otherwise fit the noise of the initialisation.
     with torch.no_grad():
-        body[-1].weight.mul_(0.01)
-        body[-1].bias.zero_()
-    body.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
+        layers[-1].weight.mul_(0.01)
+        layers[-1].bias.zero_()
+    layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
     return ProbabilisticActor(
-        TensorDictModule(body, in_keys=list(inputs), out_keys=["loc", "scale"]),
+        TensorDictModule(layers, in_keys=list(inputs), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=[out_key],
         spec=action_spec,
@@ -97,10 +132,20 @@ def make_actor(
 def make_critic(
     inputs: Mapping[NestedKey, int],
     *,
+    body: Body = "mlp",
     hidden: Sequence[int] = (256, 256),
     layer_norm: bool = True,
+    bins: int = 1,
 ) -> ValueOperator:
-    """Q-network on the concatenation of ``inputs``; writes ``state_action_value`` [*, 1].
+    """Q-network on the concatenation of ``inputs``; writes ``state_action_value`` [*, bins].
+
+    Args:
+        inputs (mapping of NestedKey to int): keys that the critic reads, with their sizes.
+
+    Keyword Args:
+        body, hidden, layer_norm: as in :func:`make_actor`.
+        bins (int): above one, the output is the logits of a categorical distribution of the
+            return; see ``support`` of :class:`~torchrl_etl.objectives.LeanSACLoss`. Default: 1.
 
     Examples:
         >>> import torch
@@ -112,7 +157,7 @@ def make_critic(
     """
     # Named here: ValueOperator calls it a state value unless a key is literally "action".
     return ValueOperator(
-        _body(sum(inputs.values()), 1, hidden, layer_norm),
+        make_layers(sum(inputs.values()), bins, body, hidden, layer_norm),
         in_keys=list(inputs),
         out_keys=["state_action_value"],
     )

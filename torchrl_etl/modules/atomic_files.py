@@ -75,11 +75,11 @@ def _aside(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.previous")
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, and flush it to disk."""
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file, whole or not at all, and flush it to disk."""
     scratch = path.with_name(f".{path.name}.tmp")
-    with scratch.open("w", encoding="utf-8") as file:
-        file.write(text)
+    with scratch.open("wb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(scratch, path)

@@ -3,6 +3,7 @@
 from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
 from torchrl_etl.objectives.decoder import DecoderLoss
 from torchrl_etl.objectives.gmvae import GMVAELoss
+from torchrl_etl.objectives.metra import METRALoss
 from torchrl_etl.objectives.sac import LeanSACLoss
 from torchrl_etl.objectives.soft_update import FusedSoftUpdate
 from torchrl_etl.objectives.synergy_sac import SynergySACLoss
@@ -13,5 +14,6 @@ __all__ = [
     "FusedSoftUpdate",
     "GMVAELoss",
     "LeanSACLoss",
+    "METRALoss",
     "SynergySACLoss",
 ]

@@ -14,6 +14,11 @@ from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_etl.functional import (
+    categorical_cross_entropy,
+    categorical_mean,
+    project_categorical,
+)
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.objectives.checks import check_parts
 
@@ -27,13 +32,21 @@ class LeanSACLoss(SACLoss):
     norm, the bias in a product) and passes every operation through one more dispatcher. Here the
     critics are evaluated one after the other, on the entries that they read and no others.
 
+    With a ``support`` the critics are categorical: they output the logits of a distribution of the
+    return on it. Their target is the whole distribution of the critic with the smaller mean,
+    shifted by the entropy bonus and the reward, shrunk by the discount, and projected back
+    (Bellemare 2017); the actor maximizes the smaller mean.
+
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
         qvalue_network (TensorDictModule): the critic, one module with one output; it is copied
             ``num_qvalue_nets`` times.
 
     Keyword Args:
-        **kwargs: see :class:`torchrl.objectives.SACLoss`.
+        support (Tensor, optional): evenly spaced returns [K], ascending; the critics then have K
+            outputs. Default: ``None``, one output that is the value itself.
+        **kwargs: see :class:`torchrl.objectives.SACLoss`; ``loss_function`` is not read where
+            critics are categorical, whose loss is the cross entropy.
 
     Keys:
         those of SACLoss.
@@ -41,7 +54,7 @@ class LeanSACLoss(SACLoss):
     Raises:
         TypeError: if the critic is not a TensorDictModule, or a ``value_network`` or
             ``skip_done_states`` is given.
-        ValueError: for an unknown reduction.
+        ValueError: for an unknown reduction, or a support that is not evenly spaced and ascending.
 
     Examples:
         >>> import torch
@@ -66,10 +79,14 @@ class LeanSACLoss(SACLoss):
         >>> loss_actor.backward()
     """
 
+    support: Tensor | None
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule,
+        *,
+        support: Tensor | None = None,
         **kwargs: Any,
     ) -> None:
         check_parts("qvalue_network", qvalue_network, TensorDictModule)
@@ -81,6 +98,10 @@ class LeanSACLoss(SACLoss):
                     "every next state; leave it out."
                 )
         super().__init__(actor_network, qvalue_network, **kwargs)
+        if support is not None:
+            _check_support(support)
+            support = support.detach().clone()
+        self.register_buffer("support", support)
 
     def _make_vmap(self) -> None:
         """Nothing is vmapped."""
@@ -100,15 +121,21 @@ class LeanSACLoss(SACLoss):
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         return inputs.set(self.tensor_keys.action, action)
 
-    def _values(self, inputs: TensorDictBase, weights: dict[str, Tensor]) -> Tensor:
-        """Q-values [critics, *] with these weights, all of them stacked."""
+    def _outputs(self, inputs: TensorDictBase, weights: dict[str, Tensor]) -> Tensor:
+        """What the critics with these weights, all of them stacked, say: [critics, *, K or 1]."""
         tensors = [inputs.get(key) for key in self.qvalue_network.in_keys]
         each = zip(*(weight.unbind(0) for weight in weights.values()), strict=True)
-        values = [
+        outputs = [
             call(self.qvalue_network, dict(zip(weights, one, strict=True)), *tensors)
             for one in each
         ]
-        return torch.stack(values).squeeze(-1)
+        return torch.stack(outputs)
+
+    def _mean(self, outputs: Tensor) -> Tensor:
+        """Q-values [critics, *] of these outputs."""
+        if self.support is None:
+            return outputs.squeeze(-1)
+        return categorical_mean(outputs, self.support)
 
     def _weights(self, network: str, *, detached: bool = False) -> dict[str, Tensor]:
         """Parameters and buffers of a network by their dotted names."""
@@ -117,30 +144,47 @@ class LeanSACLoss(SACLoss):
         return {k: x.detach() for k, x in weights.items()} if detached else weights
 
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
+        """Target values [*]; with categorical critics, target probabilities [*, K]."""
         with torch.no_grad():
             following = tensordict.get("next")
             action, log_prob = self._sample(following)
             prefix = "target_" if self.delay_qvalue else ""
             weights = self._weights(f"{prefix}qvalue_network")
-            values = self._values(self._at(following, action), weights)
-            value = values.amin(0) - self._alpha * log_prob
-            return self.value_estimator.value_estimate(
-                tensordict, next_value=value.unsqueeze(-1)
-            ).squeeze(-1)
+            outputs = self._outputs(self._at(following, action), weights)
+            if self.support is None:
+                value = self._mean(outputs).amin(0) - self._alpha * log_prob
+                return self._bootstrap(tensordict, value)
+            smaller = self._mean(outputs).argmin(0)[None, ..., None].expand_as(outputs[:1])
+            probabilities = outputs.gather(0, smaller).squeeze(0).softmax(-1)
+            # The target is affine in the next value: two of them tell it for the whole support.
+            start = self._bootstrap(tensordict, torch.zeros_like(log_prob))
+            slope = self._bootstrap(tensordict, torch.ones_like(log_prob)) - start
+            following_atoms = self.support - (self._alpha * log_prob).unsqueeze(-1)
+            atoms = start.unsqueeze(-1) + slope.unsqueeze(-1) * following_atoms
+            return project_categorical(probabilities, atoms, self.support)
+
+    def _bootstrap(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
+        estimate = self.value_estimator.value_estimate
+        return estimate(tensordict, next_value=next_value.unsqueeze(-1)).squeeze(-1)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """See :meth:`torchrl.objectives.SACLoss.qvalue_v2_loss`."""
         target = self._compute_target_v2(tensordict)
-        values = self._values(tensordict, self._weights("qvalue_network"))
-        each = distance_loss(values, target.expand_as(values), self.loss_function).sum(0)
+        outputs = self._outputs(tensordict, self._weights("qvalue_network"))
+        values = self._mean(outputs)
+        if self.support is None:
+            each = distance_loss(values, target.expand_as(values), self.loss_function)
+        else:
+            each = categorical_cross_entropy(outputs, target)
+            target = target @ self.support
         error = (values.detach() - target).abs().amax(0)
-        return self._reduced(each, tensordict), {"td_error": error}
+        return self._reduced(each.sum(0), tensordict), {"td_error": error}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """See :meth:`torchrl.objectives.SACLoss.actor_loss`."""
         action, log_prob = self._sample(tensordict)
         fixed = self._weights("qvalue_network", detached=True)
-        values = self._values(self._at(tensordict, action), fixed)
+        values = self._mean(self._outputs(self._at(tensordict, action), fixed))
         each = self._alpha * log_prob - values.min(0).values
         return self._reduced(each, tensordict), {"log_prob": log_prob.detach()}
 
@@ -152,6 +196,20 @@ class LeanSACLoss(SACLoss):
     def _reduced(self, each: Tensor, tensordict: TensorDictBase) -> Tensor:
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(each, tensordict=tensordict, weights=weights)
+
+
+def _check_support(support: Tensor) -> None:
+    steps = support.diff()
+    if (
+        support.ndim != 1
+        or len(support) < 2
+        or not (steps > 0).all()
+        or steps.std(correction=0) > 1e-4 * steps.mean()
+    ):
+        raise ValueError(
+            f"support has shape {list(support.shape)} and must be evenly spaced and ascending, of "
+            "two entries or more; make it with torch.linspace(low, high, bins)."
+        )
 
 
 def call(network: TensorDictModule, weights: dict[str, Tensor], *inputs: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """The two stages, the loop around them, checkpoints and evaluation."""
 
+from torchrl_etl.training.bench import Bench, Run
 from torchrl_etl.training.config import resumed_config, validate
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.experiment import Experiment
@@ -10,11 +11,13 @@ from torchrl_etl.training.synergy_report import fit_gmvae
 from torchrl_etl.training.video import record_episodes
 
 __all__ = [
+    "Bench",
     "Evaluation",
     "Experiment",
     "ExploreStage",
     "Interrupted",
     "LearnStage",
+    "Run",
     "evaluate",
     "fit_gmvae",
     "record_episodes",

@@ -19,11 +19,19 @@ __all__ = ["resumed_config", "validate"]
 
 _CHOICES = {
     "collector.kind": COLLECTORS,
+    "method.learner": ("etl", "sac", "lattice", "dep", "dynsyn", "eme", "sar"),
     "stage": ("explore", "learn", "all"),
     "explore.fit.actions": ("mean", "sampled", "activation"),
+    "explore.representation": ("metric", "metra"),
     "explore.buffer_storage": ("memory", "memmap"),
     "learn.buffer_storage": ("memory", "memmap"),
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
+    "learn.sac.noise": ("independent", "held"),
+    **{
+        f"{section}{network}.body": ("mlp", "residual")
+        for section in ("", "explore.", "learn.")
+        for network in ("actor", "critic")
+    },
 }
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
 
@@ -54,16 +62,17 @@ _RULES: tuple[_Rule, ...] = (
         "true or false",
         lambda v: isinstance(v, bool),
         (
-            "compile",
             "progress",
             "pictures",
             "collector.ahead",
             "explore.bonus.normalize",
             "explore.metric.delay_encoder",
-            "network.layer_norm",
-            *_both("network.layer_norm"),
+            "actor.layer_norm",
+            "critic.layer_norm",
+            *_both("actor.layer_norm", "critic.layer_norm"),
         ),
     ),
+    ("true, false or null", lambda v: v is None or isinstance(v, bool), ("compile",)),
     (
         "a whole number above 0",
         lambda v: _integer(v) and v > 0,
@@ -77,6 +86,7 @@ _RULES: tuple[_Rule, ...] = (
             "checkpoint.every",
             "vaf_curve.updates",
             "explore.encoder.embedding_dim",
+            "learn.critic.bins",
             *_both("frames"),
         ),
     ),
@@ -93,7 +103,7 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a whole number above 0 or null",
         lambda v: v is None or (_integer(v) and v > 0),
-        ("threads", "explore.gmvae.num_components", "explore.direction.num_directions"),
+        ("frames", "threads", "explore.gmvae.num_components", "explore.direction.num_directions"),
     ),
     (
         "a number above 0",
@@ -101,6 +111,8 @@ _RULES: tuple[_Rule, ...] = (
         (
             "collector.timeout",
             "explore.encoder_lr",
+            "explore.metra.epsilon",
+            "explore.metra.lambda_init",
             "explore.fit.lr",
             "learn.decoder_lr",
             "explore.metric.epsilon",
@@ -112,7 +124,7 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a number above 0 or null",
         lambda v: v is None or (_real(v) and v > 0),
-        _both("sac.action_std"),
+        (*_both("sac.action_std"), "learn.sac.return_bound"),
     ),
     (
         "a number 0 or more",
@@ -140,11 +152,12 @@ _RULES: tuple[_Rule, ...] = (
         "a list of whole numbers above 0",
         _widths,
         (
-            "network.hidden",
+            "actor.hidden",
+            "critic.hidden",
             "explore.encoder.hidden",
             "explore.gmvae.hidden",
             "vaf_curve.dims",
-            *_both("network.hidden"),
+            *_both("actor.hidden", "critic.hidden"),
         ),
     ),
 )
@@ -165,6 +178,16 @@ def validate(config: DictConfig) -> None:
         check_choice(key, OmegaConf.select(config, key), choices)
     resolve_task(config.env, config.goal)
     _check_collector(config.collector)
+    if config.method.learner != "etl" and (config.stage != "all" or config.synergies is not None):
+        raise ValueError(
+            f"method={config.method.name} has one stage and no synergies; leave stage and "
+            "synergies out."
+        )
+    if config.learn.critic.bins > 1 and config.learn.sac.return_bound is None:
+        raise ValueError(
+            f"learn.critic.bins is {config.learn.critic.bins}, which needs a bound on returns; "
+            "give learn.sac.return_bound=5 or the like."
+        )
     if config.stage == "learn" and config.synergies is None:
         raise ValueError(
             "stage=learn needs synergies=PATH, the run folder or bundle of an earlier exploration; "
@@ -205,9 +228,19 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 # What the shapes of networks, or the meaning of their weights, depend on.
-_FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir", "learn.residual")
-_FIXED += ("experiment", "faithful", "collector")  # groups; collector.kind may change
-_FIXED_SECTIONS = ("network", "encoder", "gmvae", "direction", "metric")
+_FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir")
+_FIXED += ("learn.residual", "experiment", "faithful", "collector")  # collector.kind may change
+_FIXED_SECTIONS = (
+    "method",
+    "actor",
+    "critic",
+    "encoder",
+    "gmvae",
+    "direction",
+    "metric",
+    "metra",
+    "representation",
+)
 
 
 def _check_collector(collector: DictConfig) -> None:

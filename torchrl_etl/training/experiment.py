@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
 
 from torchrl_etl.analysis import learning_curves
 from torchrl_etl.collectors import VectorCollector
@@ -26,7 +27,9 @@ from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.explore import ExploreStage
 from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.loop import StopOnSignal, run_stage
+from torchrl_etl.training.methods import METHODS
 from torchrl_etl.training.run_folder import RunFolder, facts
+from torchrl_etl.training.sac import SACStage
 from torchrl_etl.training.synergy_report import describe_synergies, draw_synergies
 from torchrl_etl.transforms import SynergyAction
 
@@ -62,8 +65,13 @@ class Experiment:
         self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
+        self.method = None  # ETL, whose stages are below
+        if config.method.learner != "etl":
+            self.method = METHODS[config.method.learner](self)
         if config.synergies is not None:
             self._take_bundle()
+        if config.frames is not None:
+            self._divide_frames()
         if self.config.num_synergies > len(self.actuators):
             raise ValueError(
                 f"num_synergies is {config.num_synergies} but {config.env} has "
@@ -83,19 +91,24 @@ class Experiment:
             "goal": self.task.goal,
             "seed": self.config.seed,
         }
-        with StopOnSignal() as stop:
-            if (
-                self.config.synergies is None
-                and not surviving_folder(self.folder.synergies).exists()
-            ):
-                self._explore(stop)
-            decoder, info = self._decoder()
-            summary["synergies"] = {"task": info.task, **info.facts}
+        with StopOnSignal() as stop, closing(self.folder):
+            if self.method is None:
+                decoder, charged, summary["synergies"] = self._synergies(stop)
+            else:
+                decoder, charged = None, self.method.frames
+                summary |= self.method.prepare(stop)
             if self.config.stage != "explore":
-                charged = info.facts["frames"] if self.config.synergies is None else 0
                 summary["learn"] = self._learn(decoder, charged, stop)
-        self.folder.write_json("summary.json", {**summary, "versions": facts()})
+            self.folder.write_json("summary.json", {**summary, "versions": facts()})
         return summary
+
+    def _synergies(self, stop: StopOnSignal) -> tuple[SynergyDecoder, int, dict[str, Any]]:
+        """The decoder, the frames it took in this run, and what is known of it."""
+        given = self.config.synergies is not None
+        if not given and not surviving_folder(self.folder.synergies).exists():
+            self._explore(stop)
+        decoder, info = self._decoder()
+        return decoder, 0 if given else info.facts["frames"], {"task": info.task, **info.facts}
 
     # Stage 1 -----------------------------------------------------------------------------------
 
@@ -113,7 +126,7 @@ class Experiment:
     def _explore(self, stop: StopOnSignal) -> None:
         """Explore and leave a bundle in the run folder; that it is there says that this is done."""
         stage = self.explore_stage()
-        run_stage(stage, self.folder, stop, **self._loop_options())
+        run_stage(stage, self.folder, stop, **self.loop_options())
         torch.manual_seed(stage.seed)  # finishing gives the same whether or not it was resumed
         decoder = stage.finish(stop.check)
         numbers, warnings = describe_synergies(stage.gmvae, decoder, stage.actions())
@@ -148,16 +161,26 @@ class Experiment:
 
     # Stage 2 -----------------------------------------------------------------------------------
 
-    def learn_stage(self, decoder: SynergyDecoder) -> LearnStage:
-        """Stage 2 as configured, before its first frame."""
-        return LearnStage(
-            self._env_maker(),
-            self.spec,
-            decoder,
-            seed=2 * self.config.seed + 1,
-            device=self.device,
-            **self._options("learn"),
-        )
+    def learn_stage(self, decoder: SynergyDecoder | None) -> SACStage:
+        """Stage 2 as configured, before its first frame; without a decoder, that of a rival."""
+        if decoder is None:
+            return self.method.stage()
+        learn = self.config.learn
+        tuning = {key: learn[key] for key in ("fine_tuning", "decoder_lr", "anchor")}
+        return LearnStage(**self.learner_options(), decoder=decoder, **tuning)
+
+    def learner_options(self, **env_options: bool) -> dict[str, Any]:
+        """Arguments that every stage takes that learns the task, as configured."""
+        options = self._options("learn")
+        for of_a_decoder in ("fine_tuning", "decoder_lr", "anchor"):
+            del options[of_a_decoder]
+        return {
+            "make_env": self._env_maker(**env_options),
+            "spec": self.spec,
+            "seed": 2 * self.config.seed + 1,
+            "device": self.device,
+            **options,
+        }
 
     def blank_decoder(self) -> SynergyDecoder:
         """An untrained decoder of the sizes that the configuration asks for."""
@@ -170,7 +193,7 @@ class Experiment:
             residual=self.config.learn.residual,
         )
 
-    def learned(self) -> LearnStage:
+    def learned(self) -> SACStage:
         """Stage 2 with the weights of its newest whole checkpoint.
 
         Raises:
@@ -182,19 +205,22 @@ class Experiment:
                 f"{self.folder.path} holds no whole checkpoint of stage 2; evaluate a run that has "
                 "begun to learn."
             )
-        stage = self.learn_stage(self._decoder()[0])
-        Checkpoint(actor=stage.actor, decoder=stage.decoder).load(folder)
+        decoder = self._decoder()[0] if self.method is None else None
+        stage = self.learn_stage(decoder)
+        Checkpoint(**stage.acting()).load(folder)
         return stage
 
     def _decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
         bundle = self.config.synergies or self.folder.synergies
         return load_bundle(bundle, residual=self.config.learn.residual)
 
-    def evaluation_env(self, stage: LearnStage) -> EnvBase:
-        """One simulator, driven by the stage's decoder."""
-        return TransformedEnv(self.make_env(), SynergyAction(stage.decoder))
+    def evaluation_env(self, stage: SACStage) -> EnvBase:
+        """One simulator, driven by the stage's decoder if it has one."""
+        if isinstance(stage, LearnStage):
+            return TransformedEnv(self.make_env(), SynergyAction(stage.decoder))
+        return self.make_env()
 
-    def evaluator(self, stage: LearnStage) -> Callable[[], Evaluation]:
+    def evaluator(self, stage: SACStage) -> Callable[[], Evaluation]:
         """Evaluates the stage's present policy on the evaluation seeds."""
         steps = episode_length(self.config.env, self.config.goal) or 1000
         return partial(
@@ -205,7 +231,9 @@ class Experiment:
             max_steps=steps,
         )
 
-    def _learn(self, decoder: SynergyDecoder, charged: int, stop: StopOnSignal) -> dict[str, Any]:
+    def _learn(
+        self, decoder: SynergyDecoder | None, charged: int, stop: StopOnSignal
+    ) -> dict[str, Any]:
         stage = self.learn_stage(decoder)
         evaluator = self.evaluator(stage)
         last = run_stage(
@@ -215,7 +243,7 @@ class Experiment:
             evaluate=evaluator,
             evaluate_every=self.config.evaluation.every,
             offset=charged,
-            **self._loop_options(),
+            **self.loop_options(),
         )
         after = last or evaluator()
         if self.config.pictures:
@@ -247,14 +275,14 @@ class Experiment:
 
     # Shared ------------------------------------------------------------------------------------
 
-    def _env_maker(self, *, activations: bool = False) -> Callable[[], TransformedEnv]:
+    def _env_maker(self, **options: bool) -> Callable[[], TransformedEnv]:
         """Builds the simulators of one collector; it is sent to other processes as it is."""
         return partial(
             _env_of_a_collector,
             self.config.env,
             goal=self.config.goal,
             num_envs=self.config.collector.num_envs,
-            activations=activations,
+            **options,
         )
 
     def _options(self, stage: str) -> dict[str, Any]:
@@ -265,10 +293,13 @@ class Experiment:
         collector["collector_class"] = VectorCollector if batched else Collector
         for engine in ("ray", "distributed"):
             collector[engine] = OmegaConf.to_container(self.config[engine], resolve=True)
-        own = {"compile": self.config.compile, "scratch": self.path / "buffer"}
+        compile = self.config.compile
+        if compile is None:  # what it takes to begin must pay
+            compile = options["frames"] * options["updates_per_frame"] >= 10_000
+        own = {"compile": compile, "scratch": self.path / "buffer"}
         return {"collector": collector, **own, **options}
 
-    def _loop_options(self) -> dict[str, Any]:
+    def loop_options(self) -> dict[str, Any]:
         return {
             "checkpoint_every": self.config.checkpoint.every,
             "keep": self.config.checkpoint.keep,
@@ -278,6 +309,11 @@ class Experiment:
 
     def _build_once(self) -> None:
         """Let every part object to its arguments now, not when its stage comes."""
+        if self.method is not None:
+            self.learn_stage(None)
+            if self.method.env_options:  # otherwise the environment is as that of ``spec``
+                self.make_env(**self.method.env_options).close()
+            return
         if self.config.synergies is None:
             self.explore_stage()
             if self._shows_activations:  # otherwise the environment is as that of ``spec``
@@ -287,6 +323,20 @@ class Experiment:
     @property
     def _shows_activations(self) -> bool:
         return self.config.explore.fit.actions == "activation"
+
+    def _divide_frames(self) -> None:
+        """Leave to stage 2 what stage 1 does not take."""
+        if self.method is None:
+            first = self.config.explore.frames if self.config.synergies is None else 0
+        else:
+            first = self.method.frames
+        left = self.config.frames - first
+        if left < 1:
+            raise ValueError(
+                f"frames is {self.config.frames}, of which {first} go into what comes before "
+                "learning; give more in all, or less to that."
+            )
+        self.config.learn.frames = left
 
     def _take_bundle(self) -> None:
         """Check the given bundle, and let its own d and its absolute path stand in the config."""
@@ -299,4 +349,6 @@ class Experiment:
 
 
 def _env_of_a_collector(name: str, **kwargs: Any) -> TransformedEnv:
-    return TransformedEnv(make_env(name, **kwargs, device="cpu"), RewardSum())
+    return TransformedEnv(
+        make_env(name, **kwargs, device="cpu"), Compose(RewardSum(), InitTracker())
+    )

@@ -24,6 +24,7 @@ from torchrl_etl.objectives import (
     FusedSoftUpdate,
     GMVAELoss,
     LeanSACLoss,
+    METRALoss,
 )
 from torchrl_etl.training.stage import (
     Stage,
@@ -57,8 +58,8 @@ class ExploreStage(Stage):
 
     Keyword Args:
         num_synergies (int): d.
-        network, encoder, direction, bonus, metric, gmvae, sac (mapping): keyword arguments of
-            :func:`~torchrl_etl.modules.make_actor`/``make_critic``,
+        actor, critic, encoder, direction, bonus, metric, gmvae, sac (mapping): keyword arguments of
+            :func:`~torchrl_etl.modules.make_actor`, :func:`~torchrl_etl.modules.make_critic`,
             :class:`~torchrl_etl.modules.StateEncoder`,
             :class:`~torchrl_etl.transforms.DirectionPrimer`,
             :class:`~torchrl_etl.transforms.IntrinsicReward`,
@@ -68,6 +69,8 @@ class ExploreStage(Stage):
         fit (mapping): how the GMVAE is trained: ``actions`` ("mean", "sampled" or
             "activation"), ``best_share`` (share of each batch, by task reward, that it sees),
             ``lr``, ``kl_weight``, ``component_kl_weight``, ``final_updates``.
+        representation (str): "metric" trains φ on the behavioral metric, "metra" on the bonus under
+            a constraint; ``metra`` has :class:`~torchrl_etl.objectives.METRALoss`'s arguments.
         encoder_lr (float), encoder_tau (float): of φ and of its target.
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
     """
@@ -80,13 +83,16 @@ class ExploreStage(Stage):
         spec: EnvBase,
         *,
         num_synergies: int,
-        network: Mapping[str, Any],
+        actor: Mapping[str, Any],
+        critic: Mapping[str, Any],
         encoder: Mapping[str, Any],
         encoder_lr: float,
         encoder_tau: float,
         direction: Mapping[str, Any],
         bonus: Mapping[str, Any],
+        representation: Literal["metric", "metra"],
         metric: Mapping[str, Any],
+        metra: Mapping[str, Any],
         gmvae: Mapping[str, Any],
         fit: Mapping[str, Any],
         sac: Mapping[str, Any],
@@ -98,8 +104,8 @@ class ExploreStage(Stage):
         observation_dim = spec.observation_spec["observation"].shape[-1]
         inputs = {"observation": observation_dim, "direction": encoder["embedding_dim"]}
 
-        actor = make_actor(inputs, action_spec, **network).to(device)
-        critic = make_critic({**inputs, "action": action_spec.shape[-1]}, **network).to(device)
+        policy = make_actor(inputs, action_spec, **actor).to(device)
+        value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
         self.encoder = StateEncoder(observation_dim, **encoder).to(device)
         self.gmvae = GMVAE.from_spec(action_spec, num_synergies, **gmvae).to(device)
 
@@ -107,7 +113,7 @@ class ExploreStage(Stage):
         make_primer()  # objects to its arguments now
         super().__init__(
             lambda: make_base_env().append_transform(make_primer()),
-            actor,
+            policy,
             device=device,
             **stage,
         )
@@ -115,8 +121,8 @@ class ExploreStage(Stage):
         self.buffer.append_transform(self.bonus)
 
         self.sac = LeanSACLoss(
-            actor,
-            critic,
+            policy,
+            value,
             action_spec=action_spec,
             target_entropy=entropy_target(action_spec, sac["action_std"]),
             alpha_init=sac["alpha_init"],
@@ -124,12 +130,15 @@ class ExploreStage(Stage):
         self.sac.set_keys(reward="intrinsic_reward")
         self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
 
-        dynamics = None
-        if metric.get("divergence") == "gaussian":
-            dynamics = GaussianDynamics(self.encoder.embedding_dim).to(device)
-        self.metric = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(device)
-        if metric["delay_encoder"]:
-            self.targets.append(FusedSoftUpdate(self.metric, tau=encoder_tau))
+        if representation == "metra":
+            self.metric = METRALoss(self.encoder, **metra).to(device)
+        else:
+            dynamics = None
+            if metric.get("divergence") == "gaussian":
+                dynamics = GaussianDynamics(self.encoder.embedding_dim).to(device)
+            self.metric = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(device)
+            if metric["delay_encoder"]:
+                self.targets.append(FusedSoftUpdate(self.metric, tau=encoder_tau))
 
         fit = dict(fit)
         self.fit_actions: GMVAEActions = fit.pop("actions")

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Literal
 
-import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
-from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
-from torchrl_etl.training.stage import Stage, entropy_target, make_optimizer, ready_for_training
+from torchrl_etl.training.sac import SACStage
 
 __all__ = ["LearnStage"]
 
 FineTuning = Literal["frozen", "reconstruction", "critic"]
 
 
-class LearnStage(Stage):
+class LearnStage(SACStage):
     """Algorithm 1, phase 2: SAC on synergy coefficients, the decoder mapping them to muscles.
 
     The decoder is fine-tuned in one of three modes: ``"critic"`` (default: the actor loss runs
@@ -36,14 +36,13 @@ class LearnStage(Stage):
         decoder (SynergyDecoder): from stage 1 or a bundle; it is trained in place.
 
     Keyword Args:
-        network, sac (mapping): as in :class:`~torchrl_etl.training.explore.ExploreStage`.
         fine_tuning (str): "critic", "reconstruction" or "frozen".
         decoder_lr (float): learning rate of the decoder.
         anchor (float): weight of Eq. 10 under "critic".
-        **stage: see :class:`~torchrl_etl.training.stage.Stage`.
+        **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
     """
 
-    name = "learn"
+    kept = ("observation", "synergy", "action")
 
     def __init__(
         self,
@@ -51,67 +50,43 @@ class LearnStage(Stage):
         spec: EnvBase,
         decoder: SynergyDecoder,
         *,
-        network: Mapping[str, Any],
-        sac: Mapping[str, Any],
         fine_tuning: FineTuning,
         decoder_lr: float,
         anchor: float,
-        device: torch.device,
-        **stage: Any,
+        **sac_stage: Any,
     ) -> None:
-        torch.manual_seed(stage["seed"])
-        observation_dim = spec.observation_spec["observation"].shape[-1]
-        self.decoder = decoder.to(device)
-        self.actor = actor = make_actor(
-            {"observation": observation_dim}, decoder.synergy_spec, out_key="synergy", **network
-        ).to(device)
-        critic = make_critic(
-            {"observation": observation_dim, "action": decoder.action_dim}, **network
-        ).to(device)
+        self.decoder = decoder.to(sac_stage["device"])
+        self.fine_tuning, self.decoder_lr = fine_tuning, decoder_lr
+        self.anchor = {"frozen": 0.0, "reconstruction": 1.0, "critic": anchor}[fine_tuning]
+        super().__init__(make_env, spec, **sac_stage)
+        self.decoder_loss = DecoderLoss(decoder)
 
+    def emitted(self, muscles: Bounded) -> tuple[Bounded, str]:
+        return self.decoder.synergy_spec, "synergy"
+
+    def policy_of(self, actor: TensorDictModuleBase) -> TensorDictModuleBase:
         # The decoder acts as a part of the policy: its weights then reach every worker with the
         # actor's. What it decodes is recorded as it happens.
-        super().__init__(make_env, TensorDictSequential(actor, decoder), device=device, **stage)
-        self.sac = SynergySACLoss(
-            actor,
-            critic,
-            decoder,
-            train_decoder=fine_tuning == "critic",
-            action_spec=decoder.synergy_spec,
-            target_entropy=entropy_target(decoder.synergy_spec, sac["action_std"]),
-            alpha_init=sac["alpha_init"],
-        ).to(device)
-        self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
+        return TensorDictSequential(actor, self.decoder)
 
-        self.decoder_loss = DecoderLoss(decoder)
-        self.anchor = {"frozen": 0.0, "reconstruction": 1.0, "critic": anchor}[fine_tuning]
-        tuned = [] if fine_tuning == "frozen" else list(decoder.parameters())
-        others = _without(self.sac.parameters(), decoder.parameters())
-        self.optimizer = make_optimizer(device, (others, sac["lr"]), (tuned, decoder_lr))
+    def make_loss(self, critic: TensorDictModuleBase, **options: Any) -> SynergySACLoss:
+        through = self.fine_tuning == "critic"
+        return SynergySACLoss(self.actor, critic, self.decoder, train_decoder=through, **options)
 
-    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
-        kept = batch.select("observation", "synergy", "action", ("next", "observation"))
-        kept["next"].update(batch["next"].select("done", "terminated"))
-        kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
-        return kept
+    def groups(self, lr: float) -> list[tuple[list[Tensor], float]]:
+        decoder = list(self.decoder.parameters())
+        known = {id(parameter) for parameter in decoder}
+        others = [parameter for parameter in self.sac.parameters() if id(parameter) not in known]
+        if self.fine_tuning == "frozen":
+            return [(others, lr)]
+        return [(others, lr), (decoder, self.decoder_lr)]
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        sac = self.sac(batch)
+        loss, scalars = super().losses(batch)
         reconstruction = self.decoder_loss(batch)["loss_decoder"]
-        loss = sac["loss_actor"] + sac["loss_qvalue"] + sac["loss_alpha"]
         if self.anchor:
             loss = loss + self.anchor * reconstruction
-        return loss, sac.set("loss_decoder", reconstruction)
+        return loss, scalars.set("loss_decoder", reconstruction)
 
-    def parts(self) -> dict[str, Any]:
-        return {
-            "sac": self.sac,
-            "optimizer": self.optimizer,
-            "actor": self.actor,
-            "decoder": self.decoder,
-        }
-
-
-def _without(parameters: Any, excluded: Any) -> list[torch.nn.Parameter]:
-    known = {id(parameter) for parameter in excluded}
-    return [parameter for parameter in parameters if id(parameter) not in known]
+    def acting(self) -> dict[str, Any]:
+        return {**super().acting(), "decoder": self.decoder}

@@ -146,6 +146,7 @@ class _Report:
     def __init__(self, stage: Stage, folder: RunFolder, bar: tqdm, offset: int) -> None:
         self.stage, self.folder, self.bar, self.offset = stage, folder, bar, offset
         self.shown: dict[str, str] = {}
+        self.clock = time.perf_counter()
         self.forget_open_window()
 
     def forget_open_window(self) -> None:
@@ -163,6 +164,9 @@ class _Report:
         if losses is not None:
             self.losses.append(losses)
         self.bar.update(self.stage.frames - self.bar.n)
+        now = time.perf_counter()
+        self.stage.progress.seconds += now - self.clock
+        self.clock = now
 
     def write(self) -> None:
         values = {"updates": self.stage.progress.updates, "episodes": self.stage.progress.episodes}
@@ -174,6 +178,7 @@ class _Report:
             values[key] = sum(loss[key].item() for loss in self.losses) / len(self.losses)
         elapsed = time.perf_counter() - self.start
         values["frames_per_second"] = (self.stage.frames - self.since) / elapsed
+        values["wall_seconds"] = self.stage.progress.seconds
         self._log(values)
         if self.returns:
             self._show(**{"return": f"{values['return']:.1f}"})
@@ -182,6 +187,7 @@ class _Report:
     def evaluation(self, evaluation: Evaluation) -> None:
         means = {name: value.mean for name, value in evaluation.intervals().items()}
         values = {f"eval/{name}": mean for name, mean in means.items()}
+        values["eval/wall_seconds"] = self.stage.progress.seconds
         if "solved" in means:
             self._show(solved=f"{means['solved']:.0%}")
         self._show(eval=f"{values['eval/return']:.1f}")

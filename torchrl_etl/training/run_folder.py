@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
@@ -50,7 +51,13 @@ class RunFolder:
             )
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = FileLock(self.path / ".lock", is_singleton=True)
+            self._lock.acquire(timeout=0)
             write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
+        except Timeout:
+            raise FileExistsError(
+                f"Another process is at work in {self.path}; wait for it, or stop it."
+            ) from None
         except OSError as error:
             raise OSError(
                 f"The run folder {self.path} cannot be written ({error.strerror}); choose another "
@@ -60,6 +67,21 @@ class RunFolder:
         versions = self.path / "versions.json"
         before = json.loads(versions.read_text()) if versions.exists() else []
         self.write_json("versions.json", [*before, facts()])
+
+    def close(self) -> None:
+        """Let other processes have the folder."""
+        self._lock.release()
+
+    @staticmethod
+    def is_locked(path: Path) -> bool:
+        """Whether some process has this folder open."""
+        lock = FileLock(Path(path) / ".lock", is_singleton=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return True
+        lock.release()
+        return False
 
     def write_json(self, name: str, content: Any) -> Path:
         """Write a JSON file atomically; returns its path."""

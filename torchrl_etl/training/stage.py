@@ -46,11 +46,13 @@ __all__ = [
 class Progress:
     """Counters of a stage, saved with it.
 
-    ``owed`` is the fraction of an update that the frames so far have earned but not yet had.
+    ``owed`` is the fraction of an update that the frames so far have earned but not yet had;
+    ``seconds`` is the wall time that the stage took, over all its starts.
     """
 
     def __init__(self) -> None:
         self.frames, self.updates, self.owed, self.episodes = 0, 0, 0.0, 0
+        self.seconds = 0.0
 
     def state_dict(self) -> dict[str, float]:
         return dict(vars(self))
@@ -139,6 +141,10 @@ class Stage(ABC):
     def parts(self) -> dict[str, Any]:
         """Stateful parts by name (losses, optimizers, statistics) for the checkpoint."""
 
+    def seen(self, batch: TensorDictBase) -> TensorDictBase:
+        """A batch [simulators, time] as it came, once a stage has taken note of what it wants."""
+        return batch
+
     # What every stage does -------------------------------------------------------------------
 
     @property
@@ -165,7 +171,7 @@ class Stage(ABC):
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
-        batch = self.batches.next().reshape(-1).to(self.device)
+        batch = self.seen(self.batches.next().to(self.device)).reshape(-1)
         self.buffer.extend(self.transitions(batch))
         self.progress.frames += batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())

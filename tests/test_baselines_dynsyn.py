@@ -1,0 +1,473 @@
+"""DynSyn: groups that are found again, and an actor that moves their members together."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sklearn.metrics import adjusted_rand_score
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+from torchrl.objectives.sac import compute_rsample_log_prob
+
+from tests import test_objectives_synergy_sac as synergy
+from torchrl_etl.baselines.dynsyn import (
+    GroupedTanhNormal,
+    MuscleGroups,
+    make_dynsyn_actor,
+    set_frames,
+)
+from torchrl_etl.baselines.muscle_groups import group_muscles, record_muscle_lengths
+from torchrl_etl.collectors.policy_on_arrays import PolicyOnArrays
+from torchrl_etl.envs import make_env
+from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.objectives import LeanSACLoss
+
+GROUPS = [0, 1, 0, 2, 1, 0]  # first members 0, 1, 3; the others 2, 4, 5
+LOW = torch.tensor([0.0, -1.0, -3.0, 0.1, -1.0, 0.0])
+HIGH = torch.tensor([1.0, 1.0, 5.0, 0.7, 1.0, 1.0])
+SPEC = Bounded(LOW, HIGH, shape=(6,))
+
+
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    torch.manual_seed(0)
+
+
+# Groups
+
+
+def planted(frames: int = 600, noise: float = 0.01, seed: int = 0) -> Tensor:
+    """Six muscles on three joints, in GROUPS; each in its own units, some a little off."""
+    generator = torch.Generator().manual_seed(seed)
+    walk = torch.randn(frames, 3, generator=generator).cumsum(0)
+    lengths = walk[:, GROUPS] * torch.tensor([1.0, 1.0, 0.1, 3.0, 7.0, 2.0]) + torch.arange(6.0)
+    return lengths + noise * lengths.std(0) * torch.randn(frames, 6, generator=generator)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_planted_groups_are_found_and_numbered_by_their_first_members(seed: int) -> None:
+    assert group_muscles(planted(seed=seed), 3, seed=seed).tolist() == GROUPS
+
+
+def test_groups_depend_on_neither_units_nor_order() -> None:
+    lengths, order = planted(), torch.randperm(6)
+    shuffled = group_muscles((1e-3 * lengths)[:, order], 3)
+    expected = [GROUPS[i] for i in order]
+    assert adjusted_rand_score(shuffled, expected) == 1
+    assert list(dict.fromkeys(shuffled.tolist())) == [0, 1, 2]
+
+
+def test_similarity_is_the_cosine_of_scaled_lengths_averaged_over_chunks() -> None:
+    # Three muscles, already within [0, 1], two chunks of two frames: p (0, .1 | 1, 0),
+    # q (.1, 0 | 1, 0), r (0, 1 | 1, 1). Mean cosines over chunks: pq (0 + 1) / 2, pr (1 + .71) / 2,
+    # qr .35. Over one chunk of four the large values decide: pq .99, pr .63, qr .57.
+    lengths = torch.tensor([[0.0, 0.1, 0.0], [0.1, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+    assert group_muscles(lengths, 2, chunk=2).tolist() == [0, 1, 0]
+    assert group_muscles(lengths, 2, chunk=4).tolist() == [0, 0, 1]
+    for other in (lengths * 7 - 3, lengths.roll(2, 0)):
+        assert group_muscles(other, 2, chunk=2).tolist() == [0, 1, 0]
+
+
+def test_as_many_groups_as_muscles_and_only_one() -> None:
+    assert group_muscles(planted(), 6).tolist() == [0, 1, 2, 3, 4, 5]
+    assert group_muscles(planted(), 1).tolist() == [0] * 6
+    assert group_muscles(planted(), 2).dtype == torch.long
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (lambda x: x[:50], {}, "at least 100 frames"),
+        (lambda x: x[:, 0], {}, r"need \[frames, muscles\]"),
+        (lambda x: x[:, :2], {}, "and 3 muscles"),
+        (lambda x: x * torch.tensor([1, 0, 1, 1, 0, 1]), {}, "length of muscle 1, 4 never changes"),
+        (lambda x: x, {"restarts": 0}, "restarts is 0"),
+    ],
+)
+def test_lengths_that_cannot_be_grouped_are_refused(
+    change: Any, options: dict[str, int], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        group_muscles(change(planted()), 3, **options)
+
+
+# Recording
+
+BODY = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0"/>
+  <worldbody>
+    <body name="one"><joint name="one" type="hinge" axis="0 0 1" damping="0.01"/>
+      <geom size="0.1" mass="1"/></body>
+    <body name="two" pos="1 0 0"><joint name="two" type="hinge" axis="0 0 1" damping="0.01"/>
+      <geom size="0.1" mass="1"/></body>
+    <body name="ball" pos="0 0 2"><freejoint/><geom size="0.1" mass="1"/></body>
+  </worldbody>
+  <actuator>
+    <motor joint="one" gear="2"/><motor joint="two"/><motor joint="one"/><motor joint="two"/>
+  </actuator>
+</mujoco>
+"""
+
+
+class TwoHinges(gym.Env):
+    """Two joints with two actuators each, and a ball that floats; 7 steps an episode."""
+
+    action_space = spaces.Box(-1, 1, (4,), np.float32)
+    observation_space = spaces.Box(-np.inf, np.inf, (9,), np.float32)
+
+    def __init__(self) -> None:
+        self.model = mujoco.MjModel.from_xml_string(BODY)
+        self.data = mujoco.MjData(self.model)
+        self.actions: list[np.ndarray] = []
+        self.velocities: list[np.ndarray] = []
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.steps = 0
+        return self.data.qpos.astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.actions.append(action)
+        self.velocities.append(self.data.qvel.copy())
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, nstep=5)
+        self.steps += 1
+        return self.data.qpos.astype(np.float32), 0.0, False, self.steps == 7, {}
+
+
+def test_recording_throws_joints_about_and_holds_what_floats() -> None:
+    inner = TwoHinges()
+    lengths = record_muscle_lengths(GymWrapper(inner), 40, amplitude=5.0, every=10, seed=1)
+    velocities = np.stack(inner.velocities)
+    assert lengths.shape == (40, 4) and not np.any(inner.actions)
+    assert not velocities[:, 2:].any()  # the ball's six
+    drawn = velocities[::10, :2]
+    assert np.abs(drawn).max() <= 5 and np.abs(drawn).max() > 2.5 and len(np.unique(drawn)) == 8
+    # Actuator lengths are joint angles times gear; an episode of 7 steps begins at zero again.
+    torch.testing.assert_close(lengths[:, 0], 2 * lengths[:, 2])
+    torch.testing.assert_close(lengths[:, 1], lengths[:, 3])
+    assert not lengths[7::7].any() and lengths[3:7].all()
+
+
+def test_recording_depends_on_the_seed_alone() -> None:
+    env = GymWrapper(TwoHinges())
+    one, two, other = (record_muscle_lengths(env, 25, amplitude=5.0, seed=s) for s in (3, 3, 4))
+    assert torch.equal(one, two) and not torch.equal(one, other)
+
+
+def test_muscles_of_one_joint_are_a_group() -> None:
+    lengths = record_muscle_lengths(GymWrapper(TwoHinges()), 500, amplitude=5.0)
+    assert group_muscles(lengths, 2).tolist() == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": 0, "amplitude": 1.0}, "frames is 0"),
+        ({"frames": 5, "amplitude": 0.0}, "amplitude is 0"),
+        ({"frames": 5, "amplitude": 1.0, "every": 0}, "every is 0"),
+    ],
+)
+def test_bad_recordings_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        record_muscle_lengths(GymWrapper(TwoHinges()), **options)
+
+
+def test_several_simulators_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_envs=1"):
+        record_muscle_lengths(make_env("overactuated", num_envs=2), 5, amplitude=1.0)
+
+
+@pytest.mark.slow
+def test_two_recordings_of_a_hand_give_mostly_the_same_groups() -> None:
+    env = make_env("myoHandPose")
+    groups = [
+        group_muscles(record_muscle_lengths(env, 1000, amplitude=100.0, seed=seed), 25)
+        for seed in (0, 1)
+    ]
+    env.close()
+    assert groups[0].shape == (39,) and int(groups[0].max()) == 24
+    assert adjusted_rand_score(*groups) > 0.7
+
+
+# Distribution
+
+
+def test_indices_of_groups() -> None:
+    groups = MuscleGroups.of(GROUPS)
+    assert groups.first.tolist() == [0, 1, 3] and groups.slot.tolist() == [0, 0, 1, 0, 2, 3]
+    assert (groups.num_groups, groups.num_muscles) == (3, 6)
+
+
+@pytest.mark.parametrize("wrong", [[0, 2], [1, 1], [], [[0, 1]], [0.0, 1.0], [-1, 0]])
+def test_groups_that_are_not_numbered_are_refused(wrong: list) -> None:
+    with pytest.raises(ValueError, match="every number from 0 to the largest"):
+        MuscleGroups.of(wrong)
+
+
+def grouped(amplitude: float = 0.1, rows: int = 50, **bounds: Tensor) -> GroupedTanhNormal:
+    loc, scale = torch.randn(rows, 3), torch.rand(rows, 3) + 0.1
+    return GroupedTanhNormal(
+        loc, scale, torch.randn(rows, 3), torch.full((rows, 1), amplitude), groups=GROUPS, **bounds
+    )
+
+
+def weights_of(action: Tensor) -> Tensor:
+    """Each member's action over its group's first's, where bounds are ±1."""
+    first = MuscleGroups.of(GROUPS).first
+    return action / action[..., first[torch.tensor(GROUPS)]]
+
+
+def test_amplitude_zero_moves_groups_as_one() -> None:
+    dist = grouped(0.0)
+    for action in (dist.sample(), dist.deterministic_sample):
+        for member, group in enumerate(GROUPS):
+            assert torch.equal(action[:, member], action[:, GROUPS.index(group)])
+
+
+def test_first_members_weigh_one_and_others_within_the_amplitude() -> None:
+    dist = grouped(0.03)
+    weights = weights_of(dist.sample((200,)))
+    assert (weights[..., [0, 1, 3]] == 1).all()
+    others = weights[..., [2, 4, 5]]
+    assert (others >= 0.97 - 1e-5).all() and (others <= 1.03 + 1e-5).all()
+    torch.testing.assert_close(others.amax(), torch.tensor(1.03), atol=1e-4, rtol=0)
+    torch.testing.assert_close(others.amin(), torch.tensor(0.97), atol=1e-4, rtol=0)
+
+
+def test_weights_by_hand() -> None:
+    # Group actions tanh(1), tanh(-1), tanh(5); weights 1 + clip(0.1 tanh v, ±0.08).
+    v = torch.tensor([0.5, 3.0, -0.5])
+    dist = GroupedTanhNormal(
+        torch.tensor([1.0, -1.0, 5.0]), torch.ones(3), v, torch.tensor([0.08]), groups=GROUPS
+    )
+    y = [math.tanh(1), math.tanh(-1), math.tanh(5)]
+    small = 0.1 * math.tanh(0.5)
+    expected = [y[0], y[1], y[0] * (1 + small), y[2], y[1] * 1.08, y[0] * (1 - small)]
+    torch.testing.assert_close(dist.deterministic_sample, torch.tensor(expected))
+
+
+def test_deviations_are_drawn_with_the_printed_spread() -> None:
+    # 0.1 tanh N(μ, e^½): the inverse of the weights is that Gaussian. In double precision weights
+    # near ±10 % can still be told apart.
+    mu = torch.tensor([0.4, -0.3, 0.0], dtype=torch.float64)
+    dist = GroupedTanhNormal(
+        torch.zeros_like(mu),
+        torch.full_like(mu, 0.3),
+        mu,
+        torch.full_like(mu[:1], 0.1),
+        groups=GROUPS,
+    )
+    v = (10 * (weights_of(dist.sample((100_000,)))[:, [2, 4, 5]] - 1)).atanh()
+    torch.testing.assert_close(v.mean(0), mu, atol=0.03, rtol=0)
+    torch.testing.assert_close(v.std(0), torch.full_like(mu, math.exp(0.5)), atol=0.03, rtol=0)
+
+
+def test_log_prob_is_that_of_the_groups_alone() -> None:
+    first = [0, 1, 3]
+    dist = grouped(low=LOW, high=HIGH)
+    theirs = TanhNormal(
+        dist.group_normal.loc, dist.group_normal.scale, low=LOW[first], high=HIGH[first]
+    )
+    action, log_prob = dist.rsample_and_log_prob((4,))
+    torch.testing.assert_close(dist.log_prob(action), theirs.log_prob(action[..., first]))
+    torch.testing.assert_close(log_prob, dist.log_prob(action), atol=2e-3, rtol=1e-3)
+    others = action.clone()
+    others[..., [2, 4, 5]] = 0.5
+    assert torch.equal(dist.log_prob(others), dist.log_prob(action))
+    assert (dist.batch_shape, dist.event_shape) == ((50,), (6,))
+
+
+def test_actions_stay_in_every_muscles_own_bounds() -> None:
+    dist = GroupedTanhNormal(
+        *(10 * torch.randn(500, 3), torch.ones(500, 3), torch.randn(500, 3)),
+        torch.tensor([0.1]),
+        groups=GROUPS,
+        low=LOW,
+        high=HIGH,
+    )
+    action = dist.sample((10,))
+    assert (action >= LOW).all() and (action <= HIGH).all()
+    torch.testing.assert_close(action.amin((0, 1)), LOW, atol=1e-3, rtol=0)
+    torch.testing.assert_close(action.amax((0, 1)), HIGH, atol=1e-3, rtol=0)
+    # A group's members sit at the same height between bounds of their own.
+    height = (dist.deterministic_sample - LOW) / (HIGH - LOW)
+    torch.testing.assert_close(height[:, 4], height[:, 1], atol=0.06, rtol=0)
+
+
+def test_one_muscle_a_group_is_the_ordinary_tanh_normal() -> None:
+    loc, scale = torch.randn(2, 5, 6)
+    dist = GroupedTanhNormal(
+        loc, scale.exp(), torch.zeros(5, 0), torch.zeros(5, 1), groups=range(6), low=LOW, high=HIGH
+    )
+    theirs = TanhNormal(loc, scale.exp(), low=LOW, high=HIGH)
+    torch.manual_seed(1)
+    action = dist.rsample()
+    torch.manual_seed(1)
+    torch.testing.assert_close(action, theirs.rsample())
+    torch.testing.assert_close(dist.log_prob(action), theirs.log_prob(action))
+
+
+# Actor
+
+
+def actor_on(**kwargs: Any) -> Any:
+    return make_dynsyn_actor({"observation": 4}, SPEC, GROUPS, **{"hidden": (8,), **kwargs})
+
+
+def observations(*rows: int) -> TensorDict:
+    return TensorDict({"observation": torch.randn(*rows, 4)}, rows)
+
+
+@pytest.mark.parametrize(
+    ("frames", "amplitude"),
+    [
+        (0, 0.0),
+        (1_000_000, 0.0),
+        (1_200_000, 0.01),
+        (2_000_000, 0.05),
+        (3_000_000, 0.1),
+        (9**9, 0.1),
+    ],
+)
+def test_amplitude_schedule_by_hand(frames: int, amplitude: float) -> None:
+    actor = actor_on()
+    set_frames(actor, frames)
+    written = actor(observations(2))["amplitude"]
+    torch.testing.assert_close(written, torch.full((2, 1), amplitude))
+
+
+def test_schedule_is_an_option() -> None:
+    actor = actor_on(slope=1e-4, start=100, ceiling=0.02)
+    for frames, amplitude in ((100, 0.0), (200, 0.01), (1000, 0.02)):
+        set_frames(actor, frames)
+        torch.testing.assert_close(actor[0].module.amplitude.item(), amplitude)
+
+
+def test_frames_travel_with_the_weights() -> None:
+    one, other = actor_on(), actor_on()
+    set_frames(one, 2_000_000)
+    other.load_state_dict(one.state_dict())
+    assert other[0].module.amplitude.item() == pytest.approx(0.05)
+    data = observations(3)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(one(data.clone())["action"], other(data.clone())["action"])
+
+
+def test_a_loss_built_on_the_actor_sees_its_frames() -> None:
+    actor = actor_on()
+    critic = make_critic({"observation": 4, "action": 6}, hidden=(8,))
+    loss = LeanSACLoss(actor, critic, target_entropy=-3.0)
+    set_frames(actor, 3_000_000)
+    action, _ = loss._sample(observations(50))
+    middle, half = (LOW + HIGH) / 2, (HIGH - LOW) / 2
+    weights = weights_of((action - middle) / half)
+    assert (weights[:, [2, 4, 5]] - 1).abs().max() > 0.05
+
+
+def test_gradients_reach_scales_and_deviations() -> None:
+    actor = actor_on()
+    set_frames(actor, 3_000_000)
+    head = actor[0].module.layers[-1]
+    action, log_prob = compute_rsample_log_prob(actor.get_dist(observations(64)))
+    by_action, by_score = (
+        torch.autograd.grad(out.sum(), head.weight, retain_graph=True)[0].abs().sum(1) > 0
+        for out in (action, log_prob)
+    )
+    assert by_action.all()
+    assert by_score.tolist() == [True] * 6 + [False] * 3  # k means, k scales, no deviation
+
+
+def test_deviations_are_learned_only_once_they_are_allowed() -> None:
+    actor = actor_on()
+    actor.get_dist(observations(64)).rsample().sum().backward()
+    assert not actor[0].module.layers[-1].weight.grad[6:].any()
+
+
+def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
+    inputs = {("agent", "observation"): 4, "direction": 2}
+    data = TensorDict(
+        {"agent": {"observation": torch.randn(5, 4)}, "direction": torch.randn(5, 2)}, [5]
+    )
+    common = {"out_key": ("agent", "action"), "body": "mlp", "hidden": (8,), "layer_norm": False}
+    for actor in (
+        make_actor(inputs, SPEC, **common),
+        make_dynsyn_actor(inputs, SPEC, torch.tensor(GROUPS), **common),
+    ):
+        assert actor.in_keys == list(inputs) and actor.dist_sample_keys == [("agent", "action")]
+        action = actor(data.clone())["agent", "action"]
+        assert action.shape == (5, 6) and (action >= LOW).all() and (action <= HIGH).all()
+
+
+@pytest.mark.parametrize(
+    ("groups", "options", "message"),
+    [
+        ([0, 1, 0], {}, "groups are of 3 muscles but the action has 6"),
+        ([0, 1, 0, 3, 1, 0], {}, "every number from 0 to the largest"),
+        (GROUPS, {"slope": -1.0}, "may not fall"),
+        (GROUPS, {"ceiling": 0.2}, "deviate by 0.1 at most"),
+    ],
+)
+def test_bad_input_is_refused_at_construction(groups: Any, options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_dynsyn_actor({"observation": 4}, SPEC, groups, **options)
+
+
+def test_follows_its_module_to_another_precision() -> None:
+    actor = actor_on().double()
+    assert actor(observations(5).double())["action"].dtype == torch.float64
+    assert actor.float()(observations(5))["action"].dtype == torch.float32
+
+
+def test_acts_on_bare_arrays_as_the_vector_collector_has_them() -> None:
+    actor, data = actor_on(), observations(3)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        on_arrays = PolicyOnArrays(actor)
+        for frames in (0, 3_000_000):  # the traced graph reads the buffer anew
+            set_frames(actor, frames)
+            action = on_arrays({"observation": data["observation"].numpy()})["action"]
+            expected = actor(data.clone())["action"]
+            torch.testing.assert_close(torch.from_numpy(action), expected)
+
+
+class TestDynSynSAC(synergy.TestSynergySACLoss):
+    """LeanSACLoss on a DynSyn actor passes the check list of losses."""
+
+    default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
+    trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
+
+    def make_loss(self, *, nested: bool = False, **kwargs: Any) -> LeanSACLoss:
+        def at(name: str) -> Any:
+            return ("agent", name) if nested else name
+
+        spec = Bounded(0.0, 1.0, shape=(synergy.ACTION,))
+        actor = make_dynsyn_actor(
+            {at("observation"): synergy.OBSERVATION},
+            spec,
+            [0, 1, 0, 1, 1],
+            out_key=at("action"),
+            hidden=(16, 16),
+        )
+        set_frames(actor, 2_000_000)
+        critic = make_critic(
+            {at("observation"): synergy.OBSERVATION, at("action"): synergy.ACTION}, hidden=(16, 16)
+        )
+        loss = LeanSACLoss(actor, critic, **{"target_entropy": -1.0, **kwargs})
+        if nested:
+            loss.set_keys(**{name: at(name) for name in ("reward", "done", "terminated")})
+        loss.make_value_estimator(gamma=synergy.GAMMA)
+        return loss

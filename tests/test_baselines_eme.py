@@ -1,0 +1,545 @@
+"""EME: the loss (check list, numbers, fixed point) and the bonus (check list, numbers)."""
+
+# ruff: noqa: RUF012  (class attributes that configure a check list are constants)
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torch.distributions import Independent, Normal, kl_divergence
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SoftUpdate
+
+from tests.loss_checks import LossChecks
+from tests.point_env import ACTION_DIM, OBSERVATION_DIM, PointEnv
+from tests.transform_checks import TransformChecks
+from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble, diversity_scale
+from torchrl_etl.baselines.eme_bonus import EMEBonus
+from torchrl_etl.modules import StateEncoder, make_actor
+from torchrl_etl.objectives import FusedSoftUpdate
+
+K = 3
+
+
+def fixed(build: Any, *args: Any, **kwargs: Any) -> Any:
+    """The same weights whatever the seed, in every process."""
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        return build(*args, **kwargs)
+
+
+# The loss
+
+
+class TestEMELoss(LossChecks):
+    default_keys = {"reward": "reward", "terminated": "terminated"}
+    targets = {"target_encoder_params"}
+    recorded = {("next", "observation"), ("next", "reward")}
+    trained = {"loss_metric": {"encoder_params"}, "loss_reward_ensemble": {"ensemble_params"}}
+    options: dict[str, Any] = {}
+
+    def make_loss(self, *, nested: bool = False, **kwargs: Any) -> EMELoss:
+        def at(name: str) -> Any:
+            return ("agent", name) if nested else name
+
+        hidden = (16, 16)
+        encoder = StateEncoder(OBSERVATION_DIM, K, hidden=hidden, in_keys=[at("observation")])
+        keys = [at("observation"), at("action")]
+        ensemble = RewardEnsemble(OBSERVATION_DIM, ACTION_DIM, 4, hidden=hidden, in_keys=keys)
+        # Its weights are no part of the loss's state.
+        actor = fixed(
+            make_actor,
+            {at("observation"): OBSERVATION_DIM},
+            Bounded(-1, 1, shape=(ACTION_DIM,)),
+            hidden=hidden,
+        )
+        with torch.no_grad():
+            actor[0].module[-2].weight.mul_(100)  # actors are made to start nearly constant
+        loss = EMELoss(encoder, ensemble, actor, **self.options | kwargs)
+        if nested:
+            loss.set_keys(reward=at("reward"), terminated=at("over"))
+        return loss
+
+    def make_data(self, batch: tuple[int, ...] = (8,), *, nested: bool = False) -> TensorDict:
+        observation, following = torch.randn(2, *batch, OBSERVATION_DIM)
+        root = {"observation": observation, "action": torch.rand(*batch, ACTION_DIM)}
+        after = {"observation": following, "reward": torch.randn(*batch, 1)}
+        after["over" if nested else "terminated"] = torch.rand(*batch, 1) < 0.2
+        if nested:
+            root, after = {"agent": root}, {"agent": after}
+        return TensorDict(root | {"next": TensorDict(after, batch)}, batch)
+
+    def test_the_policy_gets_no_gradient_and_is_left_out(self) -> None:
+        loss = self.built()
+        sum(self.losses(loss(self.data())).values()).backward()
+        assert all(parameter.grad is None for parameter in loss.actor.parameters())
+        assert {name.split(".")[0] for name, _ in loss.named_parameters()} == {
+            "encoder_params",
+            "ensemble_params",
+        }
+        assert not any("actor" in name for name in loss.state_dict())
+
+    def test_reset_cast_and_mode_leave_the_policy_alone(self) -> None:
+        loss = self.built()
+        before = copy.deepcopy(dict(loss.actor.state_dict()))
+        loss.actor.train()
+        loss.eval().double().reset_parameters_recursive()
+        assert loss.actor.training
+        for name, value in loss.actor.state_dict().items():
+            assert value.dtype == before[name].dtype and torch.equal(value, before[name])
+
+    def test_the_policy_is_never_stale(self) -> None:
+        loss, data = self.built(), self.data()
+        before = self.seeded(loss, data)["mean_policy_divergence"]
+        with torch.no_grad():
+            loss.actor[0].module[-2].weight.mul_(2)
+        assert self.seeded(loss, data)["mean_policy_divergence"] > 1.5 * before
+
+
+class TestCorrected(TestEMELoss):
+    options = {"reward_difference": "corrected", "loss_function": "l2", "subset_share": 1.0}
+
+
+class TestNoTarget(TestEMELoss):
+    options = {"delay_encoder": False}
+    targets = set()
+
+
+# Numbers on lookup tables: observation i one-hot -> row i.
+
+
+class Lookup(nn.Module):
+    def __init__(self, rows: list[list[float]]) -> None:
+        super().__init__()
+        self.rows = nn.Parameter(torch.tensor(rows))
+
+    def forward(self, observation: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return observation @ self.rows
+
+
+class Gaussian(Lookup):
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return super().forward(observation).chunk(2, -1)
+
+
+def table(rows: list[list[float]]) -> TensorDictModule:
+    return TensorDictModule(Lookup(rows), in_keys=["observation"], out_keys=["embedding"])
+
+
+def predictors(rows: list[list[float]]) -> TensorDictModule:
+    keys = ["observation", "action"]
+    return TensorDictModule(Lookup(rows), in_keys=keys, out_keys=["reward_prediction"])
+
+
+def policy(loc: list[list[float]], scale: list[list[float]]) -> ProbabilisticActor:
+    rows = [[*mean, *deviation] for mean, deviation in zip(loc, scale, strict=True)]
+    return ProbabilisticActor(
+        TensorDictModule(Gaussian(rows), in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+    )
+
+
+def transitions(
+    states: list[int], following: list[int], rewards: list[float], ended: list[bool], num: int
+) -> TensorDict:
+    one_hot = torch.eye(num)
+    return TensorDict(
+        {
+            "observation": one_hot[states],
+            "action": torch.zeros(len(states), 1),
+            "next": {
+                "observation": one_hot[following],
+                "reward": torch.tensor(rewards).unsqueeze(-1),
+                "terminated": torch.tensor(ended).unsqueeze(-1),
+            },
+        },
+        [len(states)],
+    )
+
+
+ROWS = [[0.0, 0.0], [3.0, 4.0], [0.0, 6.0]]
+D01, D02, D12 = 5.0, 6.0, 13**0.5
+LOC, SCALE = [[0.0], [1.0], [3.0]], [[1.0], [2.0], [0.5]]
+PREDICTIONS = [[0.0, 2.0], [1.0, 1.0], [0.0, 1.0]]  # variances 1, 0, 1/4
+
+
+def loss_of_tables(**options: Any) -> EMELoss:
+    options = {"gamma": 0.5, "loss_function": "l2", "subset_share": 1.0} | options
+    return EMELoss(table(ROWS), predictors(PREDICTIONS), policy(LOC, SCALE), **options)
+
+
+def kl(i: int, j: int) -> float:
+    mean, deviation = LOC[i][0] - LOC[j][0], SCALE[i][0] / SCALE[j][0]
+    return (deviation**2 + (mean / SCALE[j][0]) ** 2 - 1) / 2 - math.log(deviation)
+
+
+def test_divergence_of_policies_is_that_of_torch() -> None:
+    torch.manual_seed(0)
+    loc, scale = torch.randn(2, 6), 0.1 + torch.rand(2, 6)
+    actor = policy(loc.tolist(), scale.tolist())
+    loss = EMELoss(table(ROWS[:2]), predictors(PREDICTIONS[:2]), actor)
+    out = loss(transitions([0, 1], [1, 0], [0.0, 0.0], [False, False], 2))
+    first, second = (Independent(Normal(*row), 1) for row in zip(loc, scale, strict=True))
+    expected = (kl_divergence(first, second) + kl_divergence(second, first)) / 2
+    torch.testing.assert_close(out["mean_policy_divergence"], expected)
+
+
+def test_divergence_of_gaussians_is_that_of_the_squashed_policies() -> None:
+    torch.manual_seed(0)
+    pairs = zip(LOC[:2], SCALE[:2], strict=True)
+    first, second = (TanhNormal(torch.tensor(loc), torch.tensor(scale)) for loc, scale in pairs)
+    action = first.sample((100_000,))
+    sampled = (first.log_prob(action) - second.log_prob(action)).mean()
+    assert sampled.item() == pytest.approx(kl(0, 1), abs=0.01)
+
+
+@pytest.mark.parametrize("policy_weight", [1.0, 0.5])
+def test_targets_of_three_rows_by_hand(policy_weight: float) -> None:
+    # State i goes to i + 1; rewards 2, 1, 5.
+    data = transitions([0, 1, 2], [1, 2, 0], [2.0, 1.0, 5.0], [False] * 3, 3)
+    loss = loss_of_tables(policy_weight=policy_weight, reduction="none")
+    onward = [
+        D01 - (1 + 0.5 * D12 + policy_weight * kl(0, 1)),
+        D12 - (4 + 0.5 * D02 + policy_weight * kl(1, 2)),
+        D02 - (3 + 0.5 * D01 + policy_weight * kl(2, 0)),
+    ]
+    backward = [
+        D02 - (3 + 0.5 * D01 + policy_weight * kl(0, 2)),
+        D01 - (1 + 0.5 * D12 + policy_weight * kl(1, 0)),
+        D12 - (4 + 0.5 * D02 + policy_weight * kl(2, 1)),
+    ]
+    # Three samples can be paired in two ways only, so that none meets itself.
+    expected = [torch.tensor(errors).square() for errors in (onward, backward)]
+    seen = set()
+    for _ in range(20):
+        out = loss(data)["loss_metric"]
+        found = [i for i, each in enumerate(expected) if torch.allclose(out, each, rtol=1e-4)]
+        assert len(found) == 1
+        seen.update(found)
+    assert seen == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("ended", "future"),
+    [([True, True], 0.0), ([True, False], 6.0), ([False, True], 5.0), ([False, False], D12)],
+)
+def test_ended_episodes_share_one_absorbing_state(ended: list[bool], future: float) -> None:
+    loss = loss_of_tables(policy_weight=0.0)
+    out = loss(transitions([0, 1], [1, 2], [0.0, 0.0], ended, 3))
+    assert out["loss_metric"].item() == pytest.approx((5 - 0.5 * future) ** 2, rel=1e-4)
+
+
+def test_smooth_error_is_linear_where_it_is_large() -> None:
+    loss = loss_of_tables(loss_function="smooth_l1", policy_weight=0.0)
+    out = loss(transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3))
+    assert out["loss_metric"].item() == pytest.approx(5 - 1 - 0.5 * D12 - 0.5, rel=1e-4)
+
+
+@pytest.mark.parametrize(("reward", "left"), [(2.0, 3**0.5), (1.0, 0.0), (0.5, 0.0)])
+def test_corrected_difference_takes_the_variances_off(reward: float, left: float) -> None:
+    # The members' variances at states 0 and 1 are 1 and 0.
+    loss = loss_of_tables(reward_difference="corrected")
+    out = loss(transitions([0, 1], [1, 2], [reward, 0.0], [False, False], 3))
+    assert out["mean_reward_difference"].item() == pytest.approx(left, abs=1e-6)
+
+
+def test_ensemble_loss_and_variance_by_hand() -> None:
+    out = loss_of_tables()(transitions([0, 1, 2], [1, 2, 0], [1.0, 3.0, 1.0], [False] * 3, 3))
+    # Errors (1, 1), (2, 2), (1, 0).
+    assert out["loss_reward_ensemble"].item() == pytest.approx((1 + 4 + 0.5) / 3)
+    assert out["mean_reward_variance"].item() == pytest.approx((1 + 0 + 0.25) / 3)
+
+
+def test_members_learn_on_their_own_subsets_with_the_same_expected_loss() -> None:
+    torch.manual_seed(0)
+    count = 4_000
+    data = transitions([0] * count, [1] * count, [1.0] * count, [False] * count, 3)
+    whole = loss_of_tables(reduction="none")(data)["loss_reward_ensemble"]
+    part = loss_of_tables(subset_share=0.25, reduction="none")(data)["loss_reward_ensemble"]
+    assert part.mean().item() == pytest.approx(whole.mean().item(), rel=0.05)
+    # Of two members with error 1: both, one or none has drawn a sample, at weight 4.
+    assert set(part.tolist()) == {0.0, 2.0, 4.0}
+    assert (part == 4.0).float().mean().item() == pytest.approx(1 / 16, abs=0.02)
+
+
+def test_distances_on_a_cycle_come_to_the_fixed_point() -> None:
+    torch.manual_seed(0)
+    # 0 -> 1 -> 2 -> 0 with rewards 0, 1, 2; divergences 1/2, 1/2 and 0, the same both ways.
+    actor = policy([[0.0], [1.0], [0.0]], [[1.0]] * 3)
+    encoder = table((0.1 * torch.randn(3, 2)).tolist())
+    loss = EMELoss(encoder, predictors(PREDICTIONS), actor, gamma=0.5, loss_function="l2")
+    updater = FusedSoftUpdate(loss, tau=0.05)
+    data = transitions([0, 1, 2], [1, 2, 0], [0.0, 1.0, 2.0], [False] * 3, 3)
+    optimizer = torch.optim.Adam(loss.encoder_params.parameters(), 2e-2)
+    for _ in range(600):
+        optimizer.zero_grad()
+        loss(data)["loss_metric"].backward()
+        optimizer.step()
+        updater.step()
+    # d01 = 1.5 + d12 / 2, d12 = 1.5 + d20 / 2, d20 = 2 + d01 / 2
+    system = torch.tensor([[1.0, -0.5, 0.0], [0.0, 1.0, -0.5], [-0.5, 0.0, 1.0]])
+    expected = torch.linalg.solve(system, torch.tensor([1.5, 1.5, 2.0]))
+    rows = encoder.module.rows.detach()
+    torch.testing.assert_close((rows - rows.roll(-1, 0)).norm(dim=-1), expected, rtol=0.02, atol=0)
+
+
+def test_ensemble_agrees_where_it_has_learned_and_nowhere_else() -> None:
+    torch.manual_seed(0)
+    ensemble = RewardEnsemble(2, 1, hidden=(32,))
+    actor = policy([[0.0]] * 2, [[1.0]] * 2)
+    loss = EMELoss(StateEncoder(2, 2, hidden=(8,)), ensemble, actor)
+    SoftUpdate(loss, tau=0.1)
+    data = transitions([0, 1] * 32, [1, 0] * 32, [1.0, -1.0] * 32, [False] * 64, 2)
+    data["observation"] += 0.1 * torch.randn(64, 2)
+    optimizer = torch.optim.Adam(loss.ensemble_params.parameters(), 1e-2)
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss(data)["loss_reward_ensemble"].backward()
+        optimizer.step()
+
+    def variance(observation: torch.Tensor) -> float:
+        out = ensemble(TensorDict({"observation": observation, "action": data["action"]}, [64]))
+        return out["reward_prediction"].var(-1).mean().item()
+
+    assert variance(5 * torch.randn(64, 2)) > 30 * variance(data["observation"])
+
+
+def test_members_start_apart() -> None:
+    ensemble = RewardEnsemble(3, 2, 5)
+    data = TensorDict({"observation": torch.randn(4, 3), "action": torch.randn(4, 2)}, [4])
+    predictions = ensemble(data)["reward_prediction"]
+    assert predictions.shape == (4, 5)
+    assert (predictions.var(-1) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reward_difference": "squared"}, "choose one of sampled, corrected"),
+        ({"loss_function": "l1"}, "loss_function is 'l1'; choose one of smooth_l1, l2"),
+        ({"gamma": 1.0}, "gamma is 1.0"),
+        ({"policy_weight": -1.0}, "policy_weight is -1.0"),
+        ({"subset_share": 0.0}, "subset_share is 0.0"),
+        ({"subset_share": 1.1}, "subset_share is 1.1"),
+        ({"policy_keys": ("mean", "std")}, "the actor writes .*'loc', 'scale'"),
+        ({"policy_keys": ("loc",)}, "name the two keys"),
+    ],
+)
+def test_wrong_options_are_refused_at_construction(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        loss_of_tables(**options)
+
+
+def test_plain_networks_are_refused() -> None:
+    parts = table(ROWS), predictors(PREDICTIONS), policy(LOC, SCALE)
+    for index, name in enumerate(("encoder", "ensemble", "actor")):
+        wrong = [nn.Linear(2, 2) if i == index else part for i, part in enumerate(parts)]
+        with pytest.raises(TypeError, match=f"{name} is a Linear"):
+            EMELoss(*wrong)
+    with pytest.raises(ValueError, match="size is 0"):
+        RewardEnsemble(3, 2, 0)
+
+
+def test_one_transition_has_no_pairs() -> None:
+    with pytest.raises(ValueError, match="at least two"):
+        loss_of_tables()(transitions([0], [1], [0.0], [False], 3))
+
+
+# The bonus
+
+
+def fixed_networks() -> tuple[StateEncoder, RewardEnsemble]:
+    encoder = fixed(StateEncoder, OBSERVATION_DIM, 2, hidden=(8,))
+    ensemble = fixed(RewardEnsemble, OBSERVATION_DIM, ACTION_DIM, 3, hidden=(8,))
+    with torch.no_grad():
+        for parameter in ensemble.parameters():
+            parameter.mul_(6)  # so that they disagree by more than the scale's floor
+    return encoder, ensemble
+
+
+class TestEMEBonus(TransformChecks):
+    @staticmethod
+    def transform(nested: bool = False) -> EMEBonus:
+        def key(name: str) -> Any:
+            return ("agent", name) if nested else name
+
+        return EMEBonus(
+            *fixed_networks(),
+            weight=0.5,
+            in_keys=(key("observation"), key("action")),
+            out_keys=(key("intrinsic_reward"), key("total_reward")),
+            reward_key=key("reward"),
+        )
+
+    def check_values(self, rollout: TensorDict) -> None:
+        encoder, ensemble = fixed_networks()
+        following = rollout["next"]
+        with torch.no_grad():
+            step = encoder(following.select("observation"))["embedding"]
+            step -= encoder(rollout.select("observation"))["embedding"]
+            inputs = rollout.select("observation", "action")
+            variance = ensemble(inputs)["reward_prediction"].var(-1, correction=0, keepdim=True)
+        assert variance.max() > 1
+        expected = step.norm(dim=-1, keepdim=True) * variance.clamp(1, 10)
+        torch.testing.assert_close(following["intrinsic_reward"], expected, rtol=1e-4, atol=1e-5)
+        total = following["reward"] + 0.5 * following["intrinsic_reward"]
+        torch.testing.assert_close(following["total_reward"], total)
+        assert expected.max() > 1e-3
+        names = {"embedding", "reward_prediction", "intrinsic_reward", "total_reward"}
+        assert set(rollout.keys()).isdisjoint(names)
+
+    def test_no_env(self) -> None:
+        data = bonus_of_tables()(steps([0, 1], [1, 2], [7.0, 8.0]))
+        assert data["next", "intrinsic_reward"].flatten().tolist() == pytest.approx([5.0, D12 * 4])
+        assert data["next", "reward"].flatten().tolist() == [7.0, 8.0]
+
+    def test_compose(self) -> None:
+        data = Compose(bonus_of_tables())(steps([0], [1], [0.0]))
+        assert data["next", "intrinsic_reward"].item() == pytest.approx(5.0)
+
+    def test_model(self) -> None:
+        reads = [("next", "total_reward")]
+        network = TensorDictModule(nn.Linear(1, 2), in_keys=reads, out_keys=["out"])
+        transform = bonus_of_tables()
+        for model in (
+            nn.Sequential(transform, network),
+            TensorDictSequential(transform, network),
+        ):
+            assert model(steps([0], [1], [0.0]))["out"].shape == (1, 2)
+
+    @pytest.mark.parametrize("appended", [False, True])
+    def test_replay_buffer(self, appended: bool) -> None:
+        transform = bonus_of_tables()
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(8), batch_size=8, transform=None if appended else transform
+        )
+        if appended:
+            buffer.append_transform(transform)
+        buffer.extend(steps([0, 0], [1, 2], [0.0, 0.0]))
+        key = ("next", "intrinsic_reward")
+        assert key not in buffer._storage[:].keys(True, True), "nothing is written on extend"
+        assert {round(x, 4) for x in buffer.sample()[key].flatten().tolist()} == {5.0, 6.0}
+        transform.encoder.module.rows.data *= 10
+        transform.ensemble.module.rows.data[0] = torch.tensor([0.0, 4.0])
+        assert {round(x, 3) for x in buffer.sample()[key].flatten().tolist()} == {200.0, 240.0}
+        assert key not in buffer._storage[:].keys(True, True)
+
+    def test_inverse(self) -> None:
+        data = steps([0], [1], [0.0])
+        assert (self.transform().inv(data) == data).all()
+
+
+def bonus_of_tables(**options: Any) -> EMEBonus:
+    """Distances 5, 6 and sqrt(13); variances 1/4, 4 and 25 at states 0, 1 and 2."""
+    return EMEBonus(table(ROWS), predictors([[0.0, 1.0], [0.0, 4.0], [0.0, 10.0]]), **options)
+
+
+def steps(states: list[int], following: list[int], rewards: list[float]) -> TensorDict:
+    return transitions(states, following, rewards, [False] * len(states), 3)
+
+
+@pytest.mark.parametrize(
+    ("predictions", "scale"),
+    [([0.0, 1.0], 1.0), ([2.0, 2.0], 1.0), ([0.0, 4.0], 4.0), ([0.0, 10.0], 10.0), ([3.0], 1.0)],
+)
+def test_scale_is_the_variance_between_one_and_the_maximum(
+    predictions: list[float], scale: float
+) -> None:
+    assert diversity_scale(torch.tensor(predictions)).tolist() == [scale]
+
+
+def test_scale_multiplies_the_distance_and_has_a_maximum() -> None:
+    for maximum, scale in ((10.0, 10.0), (2.0, 2.0), (100.0, 25.0)):
+        data = bonus_of_tables(max_scale=maximum)(steps([2], [0], [0.0]))
+        assert data["next", "intrinsic_reward"].item() == pytest.approx(6.0 * scale)
+
+
+@pytest.mark.parametrize(("weight", "total"), [(0.0, 10.0), (1.0, 15.0), (0.5, 12.5)])
+def test_total_reward_is_the_tasks_plus_the_weighted_bonus(weight: float, total: float) -> None:
+    data = bonus_of_tables(weight=weight)(steps([0], [1], [10.0]))
+    assert data["next", "total_reward"].item() == pytest.approx(total)
+    assert data["next", "reward"].item() == 10.0
+
+
+def test_time_dimensions() -> None:
+    data = steps([0, 1], [1, 2], [0.0, 0.0]).reshape(1, 2)
+    bonus = bonus_of_tables()(data)["next", "intrinsic_reward"]
+    torch.testing.assert_close(bonus, torch.tensor([[[5.0], [4 * D12]]]))
+
+
+def test_a_state_that_does_not_change_earns_nothing() -> None:
+    assert bonus_of_tables()(steps([1], [1], [0.0]))["next", "intrinsic_reward"].item() < 1e-4
+
+
+def test_bonus_follows_the_loss_that_trains_its_networks() -> None:
+    encoder, ensemble = table(ROWS), predictors(PREDICTIONS)
+    loss = EMELoss(encoder, ensemble, policy(LOC, SCALE))
+    SoftUpdate(loss, tau=0.1)
+    bonus = EMEBonus(encoder, ensemble)
+    data = transitions([0, 1], [1, 2], [0.0, 0.0], [False, False], 3)
+    before = bonus(data.clone())["next", "intrinsic_reward"]
+    optimizer = torch.optim.SGD(loss.parameters(), 0.1)
+    sum(value for key, value in loss(data).items() if key.startswith("loss_")).backward()
+    optimizer.step()
+    assert (bonus(data)["next", "intrinsic_reward"] != before).all()
+
+
+def test_networks_are_held_by_reference_and_left_alone() -> None:
+    encoder, ensemble = (network.train() for network in fixed_networks())
+    transform = EMEBonus(encoder, ensemble)
+    rollout = TransformedEnv(PointEnv(), transform).rollout(2)
+    for held in (transform, transform.clone()):
+        assert held.encoder is encoder and held.ensemble is ensemble
+    transform.to("meta")
+    for network in (encoder, ensemble):
+        assert network.training
+        assert all(p.requires_grad and p.device.type == "cpu" for p in network.parameters())
+    assert not list(transform.parameters()) and not transform.state_dict()
+    assert not rollout["next", "intrinsic_reward"].requires_grad
+    twin = copy.deepcopy(transform.clone())
+    assert twin.encoder is not encoder
+
+
+def test_reward_spec_declares_bonus_and_total() -> None:
+    env = TransformedEnv(SerialEnv(2, PointEnv), TestEMEBonus.transform())
+    assert env.reward_keys == ["intrinsic_reward", "reward", "total_reward"]
+    assert env.full_reward_spec["total_reward"].shape == (2, 1)
+
+
+def test_wrong_networks_and_options_are_refused() -> None:
+    encoder, ensemble = fixed_networks()
+    with pytest.raises(TypeError, match="The encoder is a Linear without in_keys"):
+        EMEBonus(nn.Linear(1, 1), ensemble)
+    with pytest.raises(ValueError, match=r"The ensemble reads \['observation'\]"):
+        EMEBonus(encoder, encoder)
+    for options, message in (
+        ({"max_scale": 0.5}, "max_scale is 0.5"),
+        ({"weight": -1.0}, "weight is -1.0"),
+        ({"in_keys": "observation"}, "pass a pair of keys, the observation and the action"),
+        ({"out_keys": ("bonus",)}, "pass a pair of keys, the bonus and the total reward"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            EMEBonus(encoder, ensemble, **options)
+
+
+def test_missing_entries_are_named() -> None:
+    data = steps([0], [1], [0.0])
+    for key in ("observation", "action", ("next", "reward")):
+        with pytest.raises(KeyError, match="EMEBonus reads"):
+            bonus_of_tables()(data.exclude(key))
+    with pytest.raises(KeyError, match="'next'"):
+        bonus_of_tables()(data.exclude("next"))
+    with pytest.raises(KeyError, match="name the right one in in_keys"):
+        TransformedEnv(
+            PointEnv(), EMEBonus(*fixed_networks(), in_keys=("state", "action"))
+        ).rollout(1)

@@ -1,0 +1,87 @@
+"""Held noise: distributed as the actor says at every step, kept for as long as it should be."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy.stats import kstest
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_etl.modules import HeldNoise, make_actor
+
+ROWS = 2000
+
+
+def policy(**kwargs) -> HeldNoise:
+    torch.manual_seed(0)
+    actor = make_actor({"observation": 3}, Bounded(0, 1, shape=(2,)), hidden=(8,))
+    return HeldNoise(actor, **kwargs)
+
+
+def step(policy: HeldNoise, begins: bool | torch.Tensor = False, rows: int = ROWS) -> torch.Tensor:
+    entries = {
+        "observation": torch.ones(rows, 3),
+        "is_init": torch.as_tensor(begins).expand(rows, 1) if isinstance(begins, bool) else begins,
+    }
+    with torch.no_grad():
+        return policy(TensorDict(entries, [rows]))["action"]
+
+
+def test_every_step_is_distributed_as_the_actor_says():
+    held = policy()
+    for _ in range(5):
+        action = step(held)
+    entries = TensorDict({"observation": torch.ones(1, 3)}, [1])
+    distribution = held.actor.get_dist(entries)
+    before_tanh = torch.atanh(2 * action - 1)
+    standard = (before_tanh - distribution.loc) / distribution.scale
+    assert kstest(standard.detach()[:, 0], "norm").pvalue > 0.01
+    assert standard.corrcoef()[0, 1].abs() < 1.0 + 1e-6
+
+
+def test_noise_lasts_as_long_as_the_zeta_distribution_says():
+    held, longest = policy(longest=3, exponent=1.0), 3
+    first = step(held, True)
+    lasts = torch.ones(ROWS, dtype=torch.long)
+    same = torch.ones(ROWS, dtype=torch.bool)
+    for _ in range(longest):
+        same &= (step(held) == first).all(-1)
+        lasts += same
+    weights = torch.tensor([1.0, 1 / 2, 1 / 3])
+    shares = lasts.bincount(minlength=5)[1:4] / ROWS
+    torch.testing.assert_close(shares, weights / weights.sum(), atol=0.04, rtol=0)
+    assert lasts.max() == longest
+
+
+def test_an_episode_begins_with_fresh_noise_and_rows_are_independent():
+    held = policy(longest=1_000_000, exponent=0.01)  # practically for ever
+    first = step(held, True, rows=4)
+    begins = torch.tensor([[True], [False], [False], [True]])
+    second = step(held, begins, rows=4)
+    assert (first[1:3] == second[1:3]).all() and (first[[0, 3]] != second[[0, 3]]).all()
+    assert first.unique(dim=0).shape[0] == 4
+
+
+def test_without_random_exploration_it_is_the_actor():
+    held = policy()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action = step(held, rows=3)
+        entries = TensorDict({"observation": torch.ones(3, 3)}, [3])
+        torch.testing.assert_close(action, held.actor(entries)["action"])
+
+
+def test_its_memory_is_no_part_of_its_state():
+    held = policy()
+    keys = set(held.state_dict())
+    step(held, True)
+    assert set(held.state_dict()) == keys
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"), [({"exponent": 0.0}, "exponent is 0"), ({"longest": 0}, "longest is 0")]
+)
+def test_unusable_settings_are_refused(kwargs, words):
+    with pytest.raises(ValueError, match=words):
+        policy(**kwargs)

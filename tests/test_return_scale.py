@@ -1,0 +1,58 @@
+"""ReturnScale against sums worked by hand, and over any division into batches."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_etl.modules import ReturnScale
+
+REWARD = torch.tensor([[1.0, 2.0, 3.0, 4.0], [0.0, -8.0, 0.0, 2.0]])
+DONE = torch.tensor([[False, True, False, False], [False, False, False, True]])
+# γ = 1/2; an episode ends after the second reward of the first simulator.
+SUMS = torch.tensor([[1.0, 2.5, 3.0, 5.5], [0.0, -8.0, -4.0, 0.0]])
+
+
+def seen(bound: float, *cuts: int) -> ReturnScale:
+    scale = ReturnScale(0.5, bound=bound)
+    parts = zip(REWARD.tensor_split(cuts, 1), DONE.tensor_split(cuts, 1), strict=True)
+    for reward, done in parts:
+        scale.update(reward, done)
+    return scale
+
+
+@pytest.mark.parametrize("cuts", [(), (1,), (1, 3)])
+def test_scale_is_the_deviation_of_the_running_returns_or_their_largest_over_the_bound(cuts):
+    deviation = SUMS.double().std(correction=0)
+    torch.testing.assert_close(seen(100.0, *cuts).scale, deviation)
+    torch.testing.assert_close(seen(2.0, *cuts).scale, torch.tensor(4.0, dtype=torch.float64))
+    torch.testing.assert_close(seen(2.0)(REWARD), REWARD / 4)
+
+
+def test_forgetting_begins_new_episodes_and_keeps_the_scale():
+    scale = seen(2.0)
+    scale.forget()
+    scale.update(torch.tensor([[20.0], [0.0]]), torch.zeros(2, 1, dtype=torch.bool))
+    assert scale.scale == 10.0  # not 20 + 5.5 / 2, over two
+
+
+def test_nothing_seen_or_nothing_but_zeros_leaves_rewards_as_they_are():
+    scale = ReturnScale(0.9)
+    assert torch.equal(scale(REWARD), REWARD)
+    scale.update(torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.bool))
+    assert torch.equal(scale(REWARD), REWARD)
+
+
+def test_state_round_trip():
+    other = ReturnScale(0.5, bound=2.0)
+    other.load_state_dict(seen(2.0).state_dict())
+    assert other.scale == seen(2.0).scale
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [({"gamma": 1.0}, "gamma is 1"), ({"gamma": 0.9, "bound": 0}, "bound is 0")],
+)
+def test_unusable_settings_are_refused(kwargs, words):
+    with pytest.raises(ValueError, match=words):
+        ReturnScale(**kwargs)

@@ -1,0 +1,145 @@
+"""The queue: what is finished stays, what broke goes on, and nothing is counted twice."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+
+from tests.configs import CONF, ROOT, TINY
+from torchrl_etl.training import Bench, Run
+
+SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=", "threads="))]
+SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]
+
+
+def command(out: Path, *overrides: str) -> list[str]:
+    recipe = [sys.executable, str(ROOT / "recipes" / "bench.py")]
+    common = ["tasks=[overactuated]", "frames=900", f"settings={' '.join(SMALL)}", f"out={out}"]
+    return [*recipe, *common, *overrides]
+
+
+def results(out: Path) -> list[dict[str, str]]:
+    with (out / "results.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def script(tmp_path: Path, text: str) -> list[str]:
+    path = tmp_path / "script.py"
+    path.write_text(text)
+    return [str(path)]
+
+
+def small_run(tmp_path: Path, text: str) -> Run:
+    return Run("task", None, "method", 0, tmp_path / "out" / "one", script(tmp_path, text))
+
+
+@pytest.mark.slow
+def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
+    out = tmp_path / "a bench"
+    arguments = command(out, "methods=[sac,etl]", "seeds=[0]", "jobs=2")
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    first = out / "overactuated-sac-seed0" / "checkpoints" / "learn"
+    deadline = time.monotonic() + 120
+    while not list(first.glob("*/seal.json")):
+        assert process.poll() is None, process.stdout.read().decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    rows = results(out)
+    assert {row["method"] for row in rows} == {"sac", "etl"}
+    assert {row["status"] for row in rows} == {"finished"}
+    frames = {m: [int(row["frames"]) for row in rows if row["method"] == m] for m in ("sac", "etl")}
+    for method, charged in (("sac", 0), ("etl", 320)):
+        assert frames[method][0] == charged and frames[method][-1] >= 900
+        assert len(set(frames[method])) == len(frames[method])
+    assert all(float(row["wall_seconds"]) >= 0 and row["commit"] for row in rows)
+
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
+    again = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    assert again.returncode == 0 and len(before) == 2
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
+
+
+def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
+    run = small_run(tmp_path, "print('it broke'); raise SystemExit(3)")
+    bench = Bench([run], tmp_path / "out", jobs=1, attempts=2)
+    for _ in bench:
+        pass
+    assert bench.status(run) == "failed" and run.starts == 2
+    assert (run.path / "log.txt").read_text().count("it broke") == 2
+
+
+def test_a_finished_run_is_left_alone(tmp_path):
+    run = small_run(tmp_path, "raise SystemExit('it must not start')")
+    run.path.mkdir(parents=True)
+    (run.path / "summary.json").write_text("{}")
+    bench = Bench([run], tmp_path / "out", jobs=1)
+    for _ in bench:
+        pass
+    assert bench.status(run) == "finished" and run.starts == 0
+
+
+def test_runs_end_with_the_queue(tmp_path):
+    run = small_run(tmp_path, "import time; time.sleep(600)")
+    bench = Bench([run], tmp_path / "out", jobs=1)
+    next(iterator := iter(bench))
+    assert bench.status(run) == "running"
+    iterator.close()
+    assert run.process.poll() is not None
+
+
+def test_two_queues_do_not_work_in_one_folder(tmp_path):
+    bench = Bench([], tmp_path / "out", jobs=1)
+    other = f"from torchrl_etl.training import Bench; Bench([], {str(tmp_path / 'out')!r}, jobs=1)"
+    environ = os.environ | {"PYTHONPATH": str(ROOT)}
+    ended = subprocess.run([sys.executable, "-c", other], capture_output=True, env=environ)
+    assert b"Another queue works in" in ended.stderr
+    bench.stop()
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("methods=[sca]", "methods is 'sca'; choose one of"),
+        ("tasks=[myoHandPoze]", "myoHandPose"),
+        ("seeds=[-1]", "seed is -1"),
+        ("frames=0", "frames is 0"),
+        ("tasks=myoHandPose", "must be a list"),
+        ("settings='learn.sac.rl=1'", r"learn.sac.rl"),
+    ],
+)
+def test_a_mistake_is_told_before_anything_runs(override, words, recipe):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("bench", [override])
+    with pytest.raises((ValueError, HydraException), match=words):
+        recipe.queue(config)
+
+
+def test_a_misspelt_setting_is_answered_with_the_nearest(tmp_path):
+    arguments = command(tmp_path / "out", "metods=[sac]")
+    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 1 and "did you mean methods" in ended.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    """recipes/bench.py as a module."""
+    spec = importlib.util.spec_from_file_location("bench_recipe", ROOT / "recipes" / "bench.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,109 @@
+"""Every method of conf/method runs from its file, charges what it takes, and goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.configs import CONF, tiny
+from tests.test_training_resume import numbers
+from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.methods import PlayStage
+
+METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+RIVALS = [name for name in METHODS if not name.startswith("etl")]
+ELBOW = "env=myoElbowPose1D6MFixed-v0"
+BRIEFLY = {
+    "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
+    "dynsyn": ["method.options.frames=200"],
+    "sar": ["method.options.frames=448", "method.options.num_synergies=3"],
+    "eme": ["method.options.hidden=[16]"],
+}
+
+
+def config(method: str, run: Path, *overrides: str):
+    brief = BRIEFLY.get(method, [])
+    return tiny(ELBOW, f"method={method}", "frames=608", f"run_dir='{run}'", *brief, *overrides)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_file_names_itself_and_makes_stages(method):
+    made = tiny(f"method={method}", "run_dir=unused", ELBOW)
+    assert made.method.name == method
+    synergies = min(made.num_synergies, 6)
+    Experiment(tiny(f"method={method}", "run_dir=unused", ELBOW, f"num_synergies={synergies}"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", RIVALS)
+def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
+    method, tmp_path, monkeypatch
+):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    summary = Experiment(config(method, whole)).run()
+    assert 608 <= summary["learn"]["frames_charged"] < 608 + 64
+    first = {"dynsyn": 200, "sar": 448}.get(method, 0)
+    assert summary["learn"]["frames"] == summary["learn"]["frames_charged"] - first
+    frames, _ = Experiment(resumed_config(whole), resume=whole).folder.series("learn/eval/return")
+    assert frames[0] == first
+
+    save, saved = Checkpoints.save, []
+
+    def save_and_die(self, checkpoint, *, step, **kwargs):
+        save(self, checkpoint, step=step, **kwargs)
+        saved.append(step)
+        raise ZeroDivisionError("as good as killed")
+
+    monkeypatch.setattr(Checkpoints, "save", save_and_die)
+    with pytest.raises(ZeroDivisionError):
+        Experiment(config(method, broken)).run()
+    monkeypatch.undo()
+    Experiment(resumed_config(broken), resume=broken).run()
+    ours, theirs = numbers(broken), numbers(whole)
+    if method == "dep":  # the controller's memory is that of a body, which no checkpoint holds
+        assert ours.keys() == theirs.keys()
+    else:
+        assert ours == theirs
+    assert saved
+
+
+@pytest.mark.slow
+def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
+    experiment = Experiment(config("dynsyn", tmp_path / "run"))
+    groups = experiment.run()["groups"]
+    assert groups == json.loads((tmp_path / "run" / "muscle_groups.json").read_text())
+    stage = experiment.learned()
+    observation = torch.randn(50, stage.observation_dim)
+    action = stage.actor(TensorDict({"observation": observation}, [50]))["action"]
+    for group in set(groups):
+        members = action[:, [i for i, g in enumerate(groups) if g == group]]
+        assert (members == members[:, :1]).all()
+    assert stage.sac.target_entropy == -len(set(groups))
+
+
+def test_play_keeps_the_steps_of_whole_episodes_with_their_returns():
+    done = torch.tensor([False, True, False, False, True])
+    episodes = torch.tensor([3, 3, 5, 7, 7])
+    so_far = torch.tensor([1.0, 4.0, 9.0, 2.0, 6.0])
+    following = {"done": done, "episode_reward": so_far, "activation": torch.eye(5)}
+    rows = TensorDict({"collector": {"traj_ids": episodes}, "next": following}, [5])
+    found = PlayStage.finished_episodes(rows)
+    assert found["episodes"].tolist() == [3, 3, 7, 7]
+    assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
+    assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
+
+
+def test_sar_asks_for_whole_episodes_before_it_begins(tmp_path):
+    with pytest.raises(ValueError, match=r"need 400 for an episode of 100 steps each"):
+        Experiment(config("sar", tmp_path / "run", "method.options.frames=300"))
+
+
+def test_a_rival_has_no_stage_to_choose_and_no_synergies_to_take(tmp_path):
+    for override in ("stage=learn", "synergies=somewhere"):
+        with pytest.raises(ValueError, match="method=sac has one stage and no synergies"):
+            Experiment(tiny("method=sac", override, f"run_dir='{tmp_path}/run'"))

@@ -1,0 +1,269 @@
+"""Evaluations of a bench: read from one CSV file, checked row by row, grouped into runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchrl_etl.envs import list_tasks
+
+__all__ = ["COLUMNS", "BenchResults", "BenchRow", "BenchRun", "read_bench"]
+
+COLUMNS = (
+    "task",
+    "goal",
+    "method",
+    "seed",
+    "frames",
+    "return",
+    "solved",
+    "solved_time",
+    "episodes",
+    "wall_seconds",
+    "commit",
+    "versions",
+    "machine",
+    "status",
+)
+
+_RESULTS = "results.csv"
+
+
+class BenchRow(NamedTuple):
+    """One evaluation; numbers that the file leaves empty are NaN.
+
+    Attributes:
+        line: Where the file says so.
+        task, goal, method, seed: Which run it belongs to.
+        frames: Environment frames until then, exploration charged.
+        mean_return: Mean undiscounted return over the evaluation's episodes.
+        solved, solved_time: Shares in [0, 1] of episodes and of steps that were solved.
+        episodes: Number of episodes.
+        wall_seconds: Seconds since the run began.
+        commit, versions, machine: What produced the numbers.
+        status: ``"finished"``, or what became of the run.
+    """
+
+    line: int
+    task: str
+    goal: str
+    method: str
+    seed: int
+    frames: int
+    mean_return: float
+    solved: float
+    solved_time: float
+    episodes: float
+    wall_seconds: float
+    commit: str
+    versions: Mapping[str, str]
+    machine: str
+    status: str
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """The evaluations of one method on one task with one seed, in order of frames."""
+
+    rows: tuple[BenchRow, ...]
+
+    @property
+    def setting(self) -> tuple[str, str]:
+        """Task and goal."""
+        return self.rows[0].task, self.rows[0].goal
+
+    @property
+    def method(self) -> str:
+        return self.rows[0].method
+
+    @property
+    def seed(self) -> int:
+        return self.rows[0].seed
+
+    @property
+    def status(self) -> str:
+        """That of the newest row."""
+        return max(self.rows, key=lambda row: row.line).status
+
+    @property
+    def finished(self) -> bool:
+        return self.status == "finished"
+
+    @property
+    def last_frames(self) -> int:
+        return self.rows[-1].frames
+
+    def at(self, frames: int) -> BenchRow | None:
+        """The last evaluation at or before ``frames``."""
+        return next((row for row in reversed(self.rows) if row.frames <= frames), None)
+
+    def curve(self, column: str) -> np.ndarray:
+        """Frames and values of a column, [2, T], without the rows where it is missing."""
+        pairs = [(row.frames, getattr(row, column)) for row in self.rows]
+        known = [pair for pair in pairs if math.isfinite(pair[1])]
+        return np.array(known, float).reshape(-1, 2).T
+
+    def __str__(self) -> str:
+        task, goal = self.setting
+        return f"{task} ({goal}), {self.method}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class BenchResults:
+    """What one file of evaluations holds.
+
+    Attributes:
+        runs: All runs, unfinished ones too.
+        row_count: Number of rows in the file.
+        replaced: Number of rows that a repeated run made obsolete.
+    """
+
+    runs: tuple[BenchRun, ...]
+    row_count: int
+    replaced: int
+
+    @property
+    def finished(self) -> tuple[BenchRun, ...]:
+        return tuple(run for run in self.runs if run.finished)
+
+    @property
+    def unfinished(self) -> tuple[BenchRun, ...]:
+        return tuple(run for run in self.runs if not run.finished)
+
+    @property
+    def settings(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of task and goal: the paper's tasks in their order, then others by name."""
+        order = {task.name: index for index, task in enumerate(list_tasks())}
+        found = {run.setting for run in self.runs}
+        return tuple(sorted(found, key=lambda pair: (order.get(pair[0], len(order)), *pair)))
+
+
+def read_bench(folder: str | os.PathLike[str]) -> BenchResults:
+    """Read ``results.csv`` of a bench's folder.
+
+    A run may have been repeated. Of rows with the same task, goal, method, seed and frames, the
+    one that stands latest in the file counts; and where rows were replaced, so were those of the
+    older attempt at more frames than the newer one reached.
+
+    Args:
+        folder (path-like): the folder with ``results.csv``, see :data:`COLUMNS`.
+
+    Raises:
+        FileNotFoundError: if the folder or the file is missing.
+        ValueError: if the file has no rows, lacks columns, or a line has a number that cannot be
+            read; or a finished run has an evaluation without a return.
+    """
+    folder = Path(folder)
+    path = folder / _RESULTS
+    if not folder.is_dir():
+        raise FileNotFoundError(f"There is no folder {folder}; pass the one that the bench wrote.")
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{folder} has no {_RESULTS}; pass the folder that the bench wrote."
+        )
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+        if reader.fieldnames and missing:
+            raise ValueError(
+                f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it needs "
+                f"{', '.join(COLUMNS)}."
+            )
+        rows = [_row(path, reader.line_num, cells) for cells in reader]
+    if not rows:
+        raise ValueError(f"{path} has no rows; evaluate at least one run first.")
+    runs, kept = _runs(rows), 0
+    for run in runs:
+        kept += len(run.rows)
+        for row in run.rows:
+            if run.finished and not math.isfinite(row.mean_return):
+                raise ValueError(
+                    f"{path}, line {row.line}: {run} is finished but this evaluation has no finite "
+                    "return; mend the row, or give the run's last row another status."
+                )
+    return BenchResults(runs, len(rows), len(rows) - kept)
+
+
+def _runs(rows: list[BenchRow]) -> tuple[BenchRun, ...]:
+    found: dict[tuple[Any, ...], list[BenchRow]] = {}
+    for row in rows:
+        found.setdefault((row.task, row.goal, row.method, row.seed), []).append(row)
+    runs = []
+    for attempts in found.values():
+        latest = {row.frames: row for row in attempts}
+        if len(latest) < len(attempts):
+            reached = attempts[-1].frames
+            latest = {frames: row for frames, row in latest.items() if frames <= reached}
+        runs.append(BenchRun(tuple(latest[frames] for frames in sorted(latest))))
+    return tuple(sorted(runs, key=lambda run: (*run.setting, run.method, run.seed)))
+
+
+def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> BenchRow:
+    where = f"{path}, line {line}"
+    if None in cells or None in cells.values():
+        raise ValueError(
+            f"{where}: the number of cells is not that of the header; complete the line or "
+            "delete it (a writer that was killed leaves half a line)."
+        )
+    text = {name: cells[name].strip() for name in COLUMNS}
+    for name in ("task", "method", "status"):
+        if not text[name]:
+            raise ValueError(f"{where}: {name} is empty; every evaluation needs one.")
+    seed, frames = (_integer(where, name, text[name]) for name in ("seed", "frames"))
+    solved, solved_time = (_share(where, name, text[name]) for name in ("solved", "solved_time"))
+    return BenchRow(
+        line=line,
+        task=text["task"],
+        goal=text["goal"] or "fixed",
+        method=text["method"],
+        seed=seed,
+        frames=frames,
+        mean_return=_number(where, "return", text["return"]),
+        solved=solved,
+        solved_time=solved_time,
+        episodes=_number(where, "episodes", text["episodes"]),
+        wall_seconds=_number(where, "wall_seconds", text["wall_seconds"]),
+        commit=text["commit"],
+        versions=_versions(where, text["versions"]),
+        machine=text["machine"],
+        status=text["status"],
+    )
+
+
+def _number(where: str, name: str, text: str) -> float:
+    try:
+        return float(text) if text else math.nan
+    except ValueError as error:
+        raise ValueError(f"{where}: {name} is {text!r}, which is not a number.") from error
+
+
+def _integer(where: str, name: str, text: str) -> int:
+    value = _number(where, name, text)
+    if not (math.isfinite(value) and value >= 0 and value == int(value)):
+        raise ValueError(f"{where}: {name} is {text!r}; it must be a whole number from 0 up.")
+    return int(value)
+
+
+def _share(where: str, name: str, text: str) -> float:
+    value = _number(where, name, text)
+    if value < 0 or value > 1:
+        raise ValueError(f"{where}: {name} is {text}; it must be a share in [0, 1], or empty.")
+    return value
+
+
+def _versions(where: str, text: str) -> Mapping[str, str]:
+    try:
+        versions = json.loads(text or "{}")
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{where}: versions is not a JSON text ({error}).") from error
+    if not isinstance(versions, dict):
+        raise ValueError(f"{where}: versions must be a JSON object of names and versions.")
+    return {str(name): str(version) for name, version in versions.items()}

@@ -1,0 +1,384 @@
+"""What a bench's runs say at an equal number of frames: interquartile means and comparisons.
+
+The estimators are those of Agarwal et al., "Deep reinforcement learning at the edge of the
+statistical precipice" (2021), and the intervals come from the authors' library, rliable: seeds are
+resampled within each task, so tasks stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rliable import library, metrics
+from scipy.stats import bootstrap
+
+from torchrl_etl.analysis.bench_results import BenchRun
+from torchrl_etl.analysis.published import best_published, environment_id
+from torchrl_etl.analysis.statistics import Interval
+
+__all__ = [
+    "Comparison",
+    "MethodResult",
+    "OverallResult",
+    "Scale",
+    "common_budget",
+    "compare",
+    "iqm",
+    "mean_band",
+    "normalize",
+    "overall",
+    "probability_of_improvement",
+]
+
+# An evaluation so far below the budget, as a share of it, still stands for the budget: episodes
+# end at will, so evaluations fall on slightly different frames.
+_TOLERANCE = 0.05
+
+
+def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
+    """Interquartile mean of the runs of all tasks, with its stratified bootstrap 95 % interval.
+
+    Args:
+        groups (sequence of array-like): for each task, one number per seed; their numbers of seeds
+            may differ.
+
+    Keyword Args:
+        repetitions (int): number of bootstrap resamples. Default: 2000.
+
+    Returns:
+        Interval: the ends are NaN where a task has one seed, which says nothing about its spread.
+
+    Examples:
+        >>> iqm([[1.0, 2.0, 3.0, 100.0]], repetitions=50).mean
+        2.5
+    """
+    return _interval(
+        _pooled_iqm, [np.asarray(group, float) for group in groups], repetitions=repetitions
+    )
+
+
+def probability_of_improvement(
+    pairs: Sequence[tuple[ArrayLike, ArrayLike]], *, repetitions: int = 2000
+) -> Interval:
+    """How often a run of one method beats a run of another on the same task, mean over tasks.
+
+    Args:
+        pairs (sequence of pairs of array-like): for each task, the one's and the other's numbers,
+            one per seed. A tie counts one half.
+
+    Keyword Args:
+        repetitions (int): number of bootstrap resamples; 0 leaves the interval away. Default: 2000.
+
+    Returns:
+        Interval: the ends are NaN where one of them has one seed on a task.
+
+    Equation:
+        1/T Σ_t 1/(N_t K_t) Σ_i Σ_j (1[x_ti > y_tj] + ½ 1[x_ti = y_tj]); what rliable computes by
+        way of the Mann-Whitney statistic, without its test, which would be most of the time here.
+
+    Examples:
+        >>> probability_of_improvement([([1.0, 3.0], [2.0, 2.0])], repetitions=0).mean
+        0.5
+    """
+    groups = [np.asarray(group, float) for pair in pairs for group in pair]
+    return _interval(_improvement, groups, repetitions=repetitions)
+
+
+def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of a band around the mean over seeds.
+
+    Args:
+        values (np.ndarray): one row per seed, one column per evaluation.
+
+    Keyword Args:
+        repetitions (int): number of bootstrap resamples. Default: 2000.
+
+    Returns:
+        tuple of np.ndarray: the percentile bootstrap's 95 % interval from three seeds up; smallest
+        and largest value of two seeds, or of one.
+
+    Examples:
+        >>> [end.tolist() for end in mean_band(np.array([[1.0, 2.0], [3.0, 2.0]]))]
+        [[1.0, 2.0], [3.0, 2.0]]
+    """
+    if len(values) < 3:
+        return values.min(axis=0), values.max(axis=0)
+    ends = bootstrap(
+        (values,),
+        np.mean,
+        axis=0,
+        n_resamples=repetitions,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return ends.low, ends.high
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method on one task at the budget; arrays have one number per run, in order of seeds."""
+
+    method: str
+    seeds: tuple[int, ...]
+    frames: np.ndarray
+    returns: np.ndarray
+    solved: np.ndarray
+    solved_time: np.ndarray
+    wall_seconds: np.ndarray
+    iqm: Interval
+    improvement: float | None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The methods on one task at one budget.
+
+    Attributes:
+        setting: Task and goal.
+        budget: Environment frames that every run here was given.
+        results: One per method, in the order of the methods.
+        untrained: Mean return of the evaluations at ``untrained_frames``, over all runs.
+        untrained_frames: The smallest number of frames at which a run was evaluated; mostly 0.
+        short: Runs left out because they ended before the budget.
+        stale: Runs whose last evaluation within the budget is more than 5 % below it.
+    """
+
+    setting: tuple[str, str]
+    budget: int
+    results: tuple[MethodResult, ...]
+    untrained: float
+    untrained_frames: int
+    short: tuple[BenchRun, ...]
+    stale: tuple[BenchRun, ...]
+
+    def result(self, method: str) -> MethodResult | None:
+        return next((result for result in self.results if result.method == method), None)
+
+
+def common_budget(runs: Sequence[BenchRun]) -> int:
+    """The largest number of frames at which all runs can be compared.
+
+    No run ends before it; and if possible every run was evaluated there, or at most 5 % earlier.
+
+    Raises:
+        ValueError: if there are no runs.
+    """
+    if not runs:
+        raise ValueError("There are no finished runs to compare; finish at least one.")
+    end = min(run.last_frames for run in runs)
+    evaluated = {row.frames for run in runs for row in run.rows if 0 < row.frames <= end}
+    shared = (b for b in sorted(evaluated, reverse=True) if not any(_stale(r, b) for r in runs))
+    return next(shared, end)
+
+
+def compare(
+    runs: Sequence[BenchRun],
+    methods: Sequence[str],
+    control: str,
+    *,
+    frames: int | None = None,
+    repetitions: int = 2000,
+) -> Comparison:
+    """Compare the methods on one task at the same number of frames.
+
+    A run counts with its last evaluation at or before that number: nothing is interpolated.
+
+    Args:
+        runs (sequence of BenchRun): the finished runs of one task and goal.
+        methods (sequence of str): which methods, in which order.
+        control (str): the method against which improvement is measured.
+
+    Keyword Args:
+        frames (int, optional): the budget; the largest common one if None.
+        repetitions (int): number of bootstrap resamples. Default: 2000.
+
+    Raises:
+        ValueError: if there are no runs, or they are of several tasks.
+    """
+    if len({run.setting for run in runs}) != 1:
+        raise ValueError("Compare the finished runs of one task and goal; pass no others.")
+    budget = common_budget(runs) if frames is None else frames
+    fair = [run for run in runs if run.last_frames >= (1 - _TOLERANCE) * budget and run.at(budget)]
+    by_method = {name: [run for run in fair if run.method == name] for name in methods}
+    baseline = [run.at(budget).mean_return for run in by_method.get(control, ())]
+    first = min(run.rows[0].frames for run in runs)
+    untrained = [run.rows[0].mean_return for run in runs if run.rows[0].frames == first]
+    return Comparison(
+        setting=runs[0].setting,
+        budget=budget,
+        results=tuple(
+            _result(name, group, budget, baseline, name == control, repetitions)
+            for name, group in by_method.items()
+            if group
+        ),
+        untrained=float(np.mean(untrained)),
+        untrained_frames=first,
+        short=tuple(run for run in runs if run not in fair),
+        stale=tuple(run for run in fair if _stale(run, budget)),
+    )
+
+
+class Scale(NamedTuple):
+    """Zero and one of a task's normalized return, and whose return the one is."""
+
+    zero: float
+    one: float
+    source: str
+
+
+def normalize(comparison: Comparison, control: str) -> Scale | str:
+    """The scale on which a task's returns are averaged with other tasks', or why there is none.
+
+    Zero is the return of the untrained policies, so negative returns do no harm. One is the best
+    published return at the same frames; the control's mean where nothing was published.
+
+    Equation:
+        (x − zero)/(one − zero)
+    """
+    zero = comparison.untrained
+    published = best_published(environment_id(*comparison.setting), comparison.budget)
+    if published is not None:
+        one, source = published[0], f"{published[1]}, published"
+    elif (baseline := comparison.result(control)) is not None:
+        one, source = float(baseline.returns.mean()), f"{control}, mean here"
+    else:
+        return f"nothing is published at {comparison.budget:,} frames and {control} lacks the task"
+    if one <= zero:
+        return f"the reference ({source}: {one:.4g}) is not above the untrained {zero:.4g}"
+    return Scale(zero, one, source)
+
+
+@dataclass(frozen=True)
+class OverallResult:
+    """One method over the tasks that it has; ``control_iqm`` is the control's on the same tasks."""
+
+    method: str
+    settings: tuple[tuple[str, str], ...]
+    missing: tuple[tuple[str, str], ...]
+    iqm: Interval
+    control_iqm: float | None
+    improvement: Interval | None
+
+
+def overall(
+    comparisons: Sequence[Comparison],
+    scales: Sequence[Scale | str],
+    methods: Sequence[str],
+    control: str,
+    *,
+    repetitions: int = 2000,
+) -> tuple[OverallResult, ...]:
+    """Aggregate each method's normalized returns over the tasks that have a scale.
+
+    Args:
+        comparisons (sequence of Comparison): one per task.
+        scales (sequence of Scale or str): for each of them, what :func:`normalize` said.
+        methods (sequence of str): which methods, in which order.
+        control (str): the method against which improvement is measured.
+
+    Keyword Args:
+        repetitions (int): number of bootstrap resamples. Default: 2000.
+    """
+    scaled = [
+        (comparison, scale)
+        for comparison, scale in zip(comparisons, scales, strict=True)
+        if isinstance(scale, Scale)
+    ]
+    results = []
+    for method in methods:
+        own = [pair for pair in scaled if pair[0].result(method)]
+        if not own:
+            continue
+        missing = tuple(c.setting for c, _ in scaled if not c.result(method))
+        pairs = [
+            (c.result(method).returns, c.result(control).returns)
+            for c, _ in own
+            if c.result(control)
+        ]
+        shared = len(pairs) == len(own)
+        results.append(
+            OverallResult(
+                method,
+                tuple(c.setting for c, _ in own),
+                missing,
+                iqm(_normalized(own, method), repetitions=repetitions),
+                _pooled_iqm(*_normalized(own, control)).item() if shared else None,
+                probability_of_improvement(pairs, repetitions=repetitions)
+                if pairs and method != control
+                else None,
+            )
+        )
+    return tuple(results)
+
+
+def _normalized(scaled: Sequence[tuple[Comparison, Scale]], method: str) -> list[np.ndarray]:
+    return [(c.result(method).returns - s.zero) / (s.one - s.zero) for c, s in scaled]
+
+
+def _result(
+    method: str,
+    runs: Sequence[BenchRun],
+    budget: int,
+    baseline: Sequence[float],
+    is_control: bool,
+    repetitions: int,
+) -> MethodResult:
+    rows = [run.at(budget) for run in runs]
+    columns = ("frames", "mean_return", "solved", "solved_time", "wall_seconds")
+    frames, returns, *others = (
+        np.array([getattr(row, name) for row in rows], float) for name in columns
+    )
+    improvement = None
+    if baseline and not is_control:
+        improvement = probability_of_improvement([(returns, baseline)], repetitions=0).mean
+    seeds = tuple(run.seed for run in runs)
+    interval = iqm([returns], repetitions=repetitions)
+    return MethodResult(method, seeds, frames, returns, *others, interval, improvement)
+
+
+def _stale(run: BenchRun, budget: int) -> bool:
+    row = run.at(budget)
+    return row is None or row.frames < (1 - _TOLERANCE) * budget
+
+
+def _pooled_iqm(*groups: np.ndarray) -> np.ndarray:
+    return np.array([metrics.aggregate_iqm(np.concatenate(groups))])
+
+
+def _improvement(*groups: np.ndarray) -> np.ndarray:
+    """Groups alternate between the one's runs and the other's, task by task."""
+    pairs = zip(groups[::2], groups[1::2], strict=True)
+    # The mean sign of all differences lies in [-1, 1], a tie at 0.
+    wins = [0.5 + 0.5 * np.sign(x.ravel()[:, None] - y.ravel()).mean() for x, y in pairs]
+    return np.array([np.mean(wins)])
+
+
+def _interval(
+    statistic: Callable[..., np.ndarray], groups: Sequence[np.ndarray], *, repetitions: int
+) -> Interval:
+    point = float(statistic(*groups)[0])
+    if repetitions == 0 or min(map(len, groups)) < 2:
+        return Interval(point, math.nan, math.nan)
+    # One array per task rather than one matrix: numbers of seeds may differ.
+    scores = [group[:, None] for group in groups]
+    with _seeded():
+        _, ends = library.get_interval_estimates({"": scores}, statistic, reps=repetitions)
+    low, high = np.ravel(ends[""]).tolist()
+    return Interval(point, low, high)
+
+
+@contextmanager
+def _seeded() -> Iterator[None]:
+    """rliable resamples with NumPy's global generator: seed it, and leave it as it was."""
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)

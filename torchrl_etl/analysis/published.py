@@ -1,0 +1,132 @@
+"""Published learning curves, to stand beside a bench's own.
+
+``published_curves.csv`` holds means over seeds at 100k to 1M environment frames, taken from the
+public results of FlashSAC and of the baselines that it ships: SimbaV2, XQC, TD-MPC2, MR.Q and PPO.
+Nothing in it was measured here, and no spread over seeds came with it.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from torchrl_etl.envs import list_tasks
+
+__all__ = ["PublishedCurve", "best_published", "caveats", "environment_id", "published_curves"]
+
+_NAMES = {"simbaV2": "SimbaV2", "xqc": "XQC", "tdmpc2": "TD-MPC2", "mrq": "MR.Q"}
+
+# Evaluations fall a little short of round numbers of frames where episodes end at will.
+_TOLERANCE = 0.05
+
+
+@dataclass(frozen=True)
+class PublishedCurve:
+    """Mean over ``seeds`` seeds of ``values`` at environment ``frames``, as published."""
+
+    algorithm: str
+    frames: tuple[int, ...]
+    values: tuple[float, ...]
+    seeds: int
+
+    def at(self, frames: float) -> float | None:
+        """The value at ``frames``, interpolated linearly; None outside the published range.
+
+        Examples:
+            >>> curve = PublishedCurve("SAC", (100_000, 200_000), (10.0, 30.0), 5)
+            >>> curve.at(150_000), curve.at(99_000), curve.at(20_000)
+            (20.0, 10.0, None)
+        """
+        first, last = self.frames[0] * (1 - _TOLERANCE), self.frames[-1] * (1 + _TOLERANCE)
+        if not first <= frames <= last:
+            return None
+        return float(np.interp(frames, self.frames, self.values))
+
+
+def environment_id(task: str, goal: str = "fixed") -> str:
+    """The id under which others publish a task; a name that this project has not named itself.
+
+    Unlike :func:`~torchrl_etl.envs.resolve_task` it builds and imports nothing, and passes unknown
+    names through, for results outlive the environments that they came from.
+
+    Examples:
+        >>> environment_id("myoHandPose", "random"), environment_id("dog-run")
+        ('myoHandPoseRandom-v0', 'dog-run')
+    """
+    for known in list_tasks():
+        if known.name == task:
+            return replace(known, goal=goal).env_id
+    return task
+
+
+def published_curves(env_id: str, metric: str = "return") -> tuple[PublishedCurve, ...]:
+    """Published curves of an environment, in the order of their names.
+
+    Args:
+        env_id (str): the environment's id, see :func:`environment_id`.
+        metric (str): ``"return"``, or ``"success"`` for the share of solved episodes.
+
+    Examples:
+        >>> [curve.algorithm for curve in published_curves("myoHandPoseFixed-v0")]
+        ['FlashSAC', 'PPO', 'SimbaV2']
+        >>> published_curves("myoLegWalk-v0")
+        ()
+    """
+    return _table().get((env_id, metric), ())
+
+
+def best_published(env_id: str, frames: float) -> tuple[float, str] | None:
+    """The highest published return at as many frames, and whose it is.
+
+    Examples:
+        >>> best_published("myoHandPoseFixed-v0", 100_000)
+        (683.46, 'FlashSAC')
+        >>> best_published("myoHandPoseFixed-v0", 10_000) is None
+        True
+    """
+    found = [
+        (value, curve.algorithm)
+        for curve in published_curves(env_id)
+        if (value := curve.at(frames)) is not None
+    ]
+    return max(found, default=None)
+
+
+def caveats(env_id: str) -> str:
+    """What must be said wherever the published curves of an environment are shown.
+
+    Examples:
+        >>> print(caveats("dog-run"))
+        Published: means over seeds from the public results of FlashSAC and of the baselines that \
+it ships, not measured here; no spread was published; their wrappers differ from this bench's \
+(TD-MPC2 ignores termination).
+    """
+    differences = ["TD-MPC2 ignores termination"]
+    if "KeyTurn" in env_id:
+        differences.insert(0, "SimbaV2 cuts Key Turn at 100 steps")
+    return (
+        "Published: means over seeds from the public results of FlashSAC and of the baselines that "
+        "it ships, not measured here; no spread was published; their wrappers differ from this "
+        f"bench's ({'; '.join(differences)})."
+    )
+
+
+@cache
+def _table() -> dict[tuple[str, str], tuple[PublishedCurve, ...]]:
+    points: dict[tuple[str, str, str, int], list[tuple[int, float]]] = {}
+    source = files("torchrl_etl.analysis") / "published_curves.csv"
+    with source.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            name = _NAMES.get(row["algorithm"], row["algorithm"])
+            key = row["env"], row["metric"], name, int(row["seeds"])
+            points.setdefault(key, []).append((int(row["env_frames"]), float(row["mean"])))
+    table: dict[tuple[str, str], tuple[PublishedCurve, ...]] = {}
+    for (env, metric, name, seeds), pairs in sorted(points.items()):
+        frames, values = zip(*sorted(pairs), strict=True)
+        curve = PublishedCurve(name, frames, values, seeds)
+        table[env, metric] = (*table.get((env, metric), ()), curve)
+    return table

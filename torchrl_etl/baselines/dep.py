@@ -1,0 +1,333 @@
+"""DEP: exploration by a controller that amplifies the movements it senses (Schumacher 2023)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from torchrl_etl.modules.checks import check_positive
+
+__all__ = ["DEPController", "DEPExploration"]
+
+_TINY = 1e-30
+_BIAS_STEP, _BIAS_DECAY = 0.05, 0.001
+
+
+class DEPController:
+    r"""Differential extrinsic plasticity: muscle lengths in, muscle commands out.
+
+    Muscles whose velocities went together a moment ago are driven together, so whatever the body
+    does by itself is taken up and made larger. There is nothing to train: the weights are
+    made of the latest movements. Each row is a body of its own.
+
+    Equation: with :math:`l_{min}, l_{max}` the extremes of each length so far and :math:`M = -I`,
+
+        | :math:`s = 2[(l - l_{min})/(l_{max} - l_{min} + 0.1) - 1/2]`
+        | :math:`x \leftarrow x + (s - x)/s_{4avg}, \quad \Delta x(t) = x(t) - x(t - 1)`
+        | :math:`C = \sum_{k<\tau} [M \Delta x(t - k)]\, \Delta x(t - k - \Delta)^T`
+        | :math:`\bar C_i = \kappa C_i / (\|(C M^T)_i\| + tiny)`
+        | :math:`q = \bar C x, \quad q \leftarrow q/(\|q\| + tiny)`
+        | :math:`h \leftarrow h - clip(bias\_rate \cdot y(t - 1), \pm 0.05) - 0.001 h`
+        | :math:`y = \tanh(\kappa q + h)`
+
+    Deviates: from the public code, which leaves the latest movement out of the sum (so that it has
+    two terms fewer), and which takes the jump of the body to a new episode for a movement;
+    here :meth:`reset` says that it is none. Of its buffer of 200 steps only the last τ + Δ
+    movements are ever read, so no others are kept.
+
+    Args:
+        rows (int): number of bodies.
+        num_muscles (int): number n of muscles.
+
+    Keyword Args:
+        kappa (float): κ, how steep commands are. Default: 1169.7.
+        tau (int): τ, how many steps the matrix is made of. Default: 40.
+        bias_rate (float): how fast a command that lasts is worn down. Default: 0.002.
+        time_distance (int): Δ, how many steps movements precede those they cause. Default: 5.
+        s4avg (float): how many steps the sensor is smoothed over, 1 for none. Default: 2.
+        device (torch.device, optional): where lengths will be.
+        dtype (torch.dtype, optional): of lengths.
+
+    Raises:
+        ValueError: if a setting is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> controller = DEPController(rows=3, num_muscles=2)
+        >>> angle = torch.linspace(0, 6, 30).sin()
+        >>> for a in angle:
+        ...     command = controller.step(torch.stack([a, -a]).expand(3, 2))
+        >>> command.shape, bool((command[:, 0] * command[:, 1] < 0).all())  # antagonists
+        (torch.Size([3, 2]), True)
+    """
+
+    def __init__(
+        self,
+        rows: int,
+        num_muscles: int,
+        *,
+        kappa: float = 1169.7,
+        tau: int = 40,
+        bias_rate: float = 0.002,
+        time_distance: int = 5,
+        s4avg: float = 2.0,
+        device: torch.device | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        check_positive(num_muscles=num_muscles, tau=tau, time_distance=time_distance)
+        if kappa <= 0 or bias_rate < 0 or s4avg < 1:
+            raise ValueError(
+                f"kappa is {kappa}, bias_rate {bias_rate} and s4avg {s4avg}; they must be "
+                "positive, not negative, and at least 1."
+            )
+        self.kappa, self.tau, self.bias_rate = kappa, tau, bias_rate
+        self.time_distance, self.s4avg = time_distance, s4avg
+        nothing = torch.zeros(rows, num_muscles, device=device, dtype=dtype)
+        self.shortest, self.longest = nothing + torch.inf, nothing - torch.inf
+        self.sensed, self.bias, self.command = nothing, nothing, nothing
+        # Newest first.
+        self.moves = nothing.unsqueeze(1).repeat(1, tau + time_distance, 1)
+        self._jumped = torch.ones(rows, 1, device=device, dtype=torch.bool)
+
+    @property
+    def rows(self) -> int:
+        return len(self.bias)
+
+    def reset(self, rows: Tensor) -> None:
+        """Some bodies begin a new episode: their way to its first lengths is no movement.
+
+        What they have learned (the extremes of the lengths, the latest movements and the bias)
+        stays, as it does in the public code.
+
+        Args:
+            rows (Tensor): which ones: a mask [rows], or their indices.
+        """
+        self._jumped[rows] = True
+
+    @torch.no_grad()
+    def step(self, lengths: Tensor) -> Tensor:
+        """Take in the lengths of one time step, adapt, and command.
+
+        Args:
+            lengths (Tensor): muscle lengths [rows, n].
+
+        Returns:
+            Tensor: commands y [rows, n] in [-1, 1].
+        """
+        self._sense(lengths)
+        # Rows of C and of C Mᵀ have the same length, as M = -I.
+        weights = self.kappa * _unit(self.matrix())
+        drive = _unit(torch.einsum("rij,rj->ri", weights, self.sensed))
+        worn = (self.bias_rate * self.command).clamp(-_BIAS_STEP, _BIAS_STEP)
+        self.bias = self.bias - worn - _BIAS_DECAY * self.bias
+        self.command = torch.tanh(self.kappa * drive + self.bias)
+        return self.command
+
+    def _sense(self, lengths: Tensor) -> None:
+        self.shortest = torch.minimum(self.shortest, lengths)
+        self.longest = torch.maximum(self.longest, lengths)
+        range_ = self.longest - self.shortest + 0.1
+        sensor = 2 * ((lengths - self.shortest) / range_ - 0.5)
+        smoothed = self.sensed + (sensor - self.sensed) / self.s4avg
+        smoothed = torch.where(self._jumped, sensor, smoothed)
+        move = (smoothed - self.sensed).masked_fill(self._jumped, 0.0)
+        self.moves = torch.cat([move.unsqueeze(1), self.moves[:, :-1]], 1)
+        self.sensed = smoothed
+        self._jumped = torch.zeros_like(self._jumped)
+
+    def matrix(self) -> Tensor:
+        """C [rows, n, n], before it is normalised."""
+        causes = self.moves[:, self.time_distance :]
+        return -torch.einsum("rki,rkj->rij", self.moves[:, : self.tau], causes)
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return vector / (vector.norm(dim=-1, keepdim=True) + _TINY)
+
+
+class DEPExploration(TensorDictModuleBase):
+    r"""Replaces a policy's actions by those of a :class:`DEPController`, now and then.
+
+    It goes behind the actor: ``TensorDictSequential(actor, DEPExploration(action_spec))``. At first
+    it acts alone; then, at each step that is the policy's, it draws whether the next few are its
+    own. It adapts all the while. Some episodes, of those that follow, are left to the policy.
+
+    Its memory is its own and in neither the tensordict nor the ``state_dict()``: pushing weights to
+    a worker leaves it alone. Row i of a batch must be the same body at every call, as it is
+    in a collector; another number of rows starts anew in all but :attr:`frames`. Random numbers
+    come from torch's global generator. It acts and adapts where exploration is set to random, as in
+    collectors; elsewhere (under deterministic exploration, or outside of
+    :class:`torchrl.envs.set_exploration_type`) actions pass and it learns nothing of them.
+
+    Equation: see :class:`DEPController`.
+
+    Deviates: the paper explores for MPO and draws once for all its environments; here the learner
+    is free, and each row draws for itself. The controller also adapts in episodes that are the
+    policy's, where the public code leaves it out, and a burst ends with its episode.
+
+    Args:
+        action_spec (Bounded): the action's leaf, unbatched.
+
+    Keyword Args:
+        dep_frames (int): frames that DEP acts alone, all rows and no other worker counted.
+            Default: 200000.
+        probability (float): of a burst, at each step that is the policy's. Default: 4e-4.
+        intervention_length (int): steps of a burst. Default: 5.
+        policy_every (int): every which episode of a row is the policy's. Default: 3.
+        action_key (NestedKey): Default: ``"action"``.
+        length_key (NestedKey): Default: ``"muscle_length"``.
+        episode_key (NestedKey, optional): what tells that an episode begins: a boolean that is true
+            at its first step, as TorchRL's ``InitTracker`` writes, or an integer that differs
+            between episodes, such as ``("collector", "traj_ids")``, which collectors write (the
+            one to give where the collector takes no ``InitTracker``, as
+            ``torchrl_etl.collectors.VectorCollector``). Default: ``"is_init"``. Without the entry
+            all is one episode.
+        **controller: see :class:`DEPController`; the defaults are those of the paper for legs.
+
+    Keys:
+        reads ``muscle_length`` [*, n], ``action`` [*, n] and, where present, ``is_init`` [*, 1] or
+        episode numbers [*]; writes ``action`` [*, n] in the bounds of the spec.
+
+    Raises:
+        TypeError: if the spec is not bounded, or for an unknown setting.
+        ValueError: if the spec is batched or a setting is out of its range; when called, if there
+            are more or fewer lengths than actuators.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictSequential
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.envs import ExplorationType, set_exploration_type
+        >>> from torchrl_etl.modules import make_actor
+        >>> spec = Bounded(0, 1, shape=(4,))
+        >>> actor = make_actor({"observation": 3}, spec)
+        >>> policy = TensorDictSequential(actor, DEPExploration(spec))
+        >>> entries = {"observation": torch.zeros(2, 3), "muscle_length": torch.rand(2, 4)}
+        >>> with set_exploration_type(ExplorationType.RANDOM):
+        ...     policy(TensorDict(entries, [2]))["action"]  # nothing has moved yet
+        tensor([[0.5000, 0.5000, 0.5000, 0.5000],
+                [0.5000, 0.5000, 0.5000, 0.5000]])
+    """
+
+    frames: int
+    """Frames seen so far. Set it to go on where another run ended."""
+
+    def __init__(
+        self,
+        action_spec: Bounded,
+        *,
+        dep_frames: int = 200_000,
+        probability: float = 4e-4,
+        intervention_length: int = 5,
+        policy_every: int = 3,
+        action_key: NestedKey = "action",
+        length_key: NestedKey = "muscle_length",
+        episode_key: NestedKey | None = "is_init",
+        **controller: float,
+    ) -> None:
+        if not isinstance(action_spec, Bounded):
+            raise TypeError(
+                f"action_spec is a {type(action_spec).__name__}; pass the action's Bounded leaf, "
+                "such as env.full_action_spec_unbatched['action']."
+            )
+        if action_spec.ndim != 1:
+            raise ValueError(
+                f"action_spec has shape {list(action_spec.shape)} but must be [actuators]; pass "
+                "the unbatched one, such as env.full_action_spec_unbatched['action']."
+            )
+        check_positive(intervention_length=intervention_length, policy_every=policy_every)
+        if dep_frames < 0 or not 0 <= probability <= 1:
+            raise ValueError(
+                f"dep_frames is {dep_frames} and probability {probability}; they must be at least "
+                "0, and the probability at most 1."
+            )
+        super().__init__()
+        self.dep_frames, self.probability = dep_frames, probability
+        self.intervention_length, self.policy_every = intervention_length, policy_every
+        self.action_key, self.length_key = unravel_key(action_key), unravel_key(length_key)
+        self.episode_key = None if episode_key is None else unravel_key(episode_key)
+        keys = (self.length_key, self.action_key, self.episode_key)
+        self.in_keys = [key for key in keys if key is not None]
+        self.out_keys = [self.action_key]
+        self.register_buffer("low", action_spec.space.low.clone(), persistent=False)
+        self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
+        self.frames, self._settings = 0, controller
+        self._start(torch.empty(0, action_spec.shape[0]))
+
+    def _start(self, lengths: Tensor) -> None:
+        # No buffers, which a collector would overwrite by the learner's when it updates weights.
+        rows, device = len(lengths), lengths.device
+        self.controller = DEPController(
+            *lengths.shape, **self._settings, device=device, dtype=lengths.dtype
+        )
+        self._burst_left = torch.zeros(rows, device=device, dtype=torch.long)
+        self._episode = torch.zeros(rows, device=device, dtype=torch.long)  # the first is 1
+        self._name: Tensor | None = None
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # Nor where none is set: a collector calls its policy once while it is built, and that is no
+        # step of a body.
+        if exploration_type() is not ExplorationType.RANDOM:
+            return tensordict
+        lengths = self._lengths(tensordict)
+        known = self.controller.bias
+        if (lengths.shape, lengths.device) != (known.shape, known.device):
+            self._start(lengths)
+        self._begin_episodes(tensordict)
+        is_dep = self._is_dep()
+        command = self.controller.step(lengths)
+        self.frames += len(lengths)
+
+        action = tensordict.get(self.action_key)
+        dep_action = self.low + (command.to(self.low) + 1) / 2 * (self.high - self.low)
+        is_dep = is_dep.view(*action.shape[:-1], 1)
+        action = torch.where(is_dep, dep_action.view_as(action).to(action), action)
+        return tensordict.set(self.action_key, action)
+
+    def _lengths(self, tensordict: TensorDictBase) -> Tensor:
+        """Muscle lengths [rows, n]."""
+        lengths = tensordict.get(self.length_key, None)
+        if lengths is None:
+            raise KeyError(
+                f"DEPExploration reads {self.length_key!r}, but the tensordict has only "
+                f"{sorted(map(str, tensordict.keys(True, True)))}; build the environment with "
+                "make_env(..., muscle_lengths=True)."
+            )
+        if lengths.shape[-1] != len(self.low):
+            raise ValueError(
+                f"{self.length_key!r} has {lengths.shape[-1]} entries for {len(self.low)} "
+                "actuators; DEP needs the length of each, in the order of the action."
+            )
+        return lengths.reshape(-1, len(self.low))
+
+    def _begin_episodes(self, tensordict: TensorDictBase) -> None:
+        entry = None if self.episode_key is None else tensordict.get(self.episode_key, None)
+        begins = self._episode == 0
+        if entry is not None:
+            entry = entry.reshape(-1)
+            if entry.dtype is torch.bool:
+                begins = begins | entry
+            elif self._name is not None:
+                begins = begins | (entry != self._name)
+            self._name = entry.clone()
+        self._episode += begins
+        self._burst_left[begins] = 0
+        self.controller.reset(begins)
+
+    def _is_dep(self) -> Tensor:
+        """Whether DEP acts [rows]; also draws, where it does not, whether it will from now on."""
+        bursting = self._burst_left > 0
+        if self.frames < self.dep_frames:
+            return torch.ones_like(bursting)
+        alone = self._episode % self.policy_every == 0
+        draw = torch.rand(len(bursting), device=bursting.device) < self.probability
+        begun = (draw & ~bursting & ~alone) * self.intervention_length
+        self._burst_left = (self._burst_left - 1).clamp_min(0) + begun
+        return bursting

@@ -1,0 +1,302 @@
+"""DynSyn: one action for each group of muscles, and small deviations from it (He 2024)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch import distributions as D
+from torchrl.data.tensor_specs import TensorSpec
+from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
+
+from torchrl_etl.modules.actor_critic import Body, make_layers
+
+__all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
+
+# The deviations' network chooses within ±10 %, whatever the amplitude allows later on.
+_DEVIATION = 0.1
+
+
+class MuscleGroups(NamedTuple):
+    """Groups as indices.
+
+    Attributes:
+        group: number of each muscle's group [n].
+        first: first member of each group [k].
+        slot: place of each muscle among those with a deviation [n], counted from 1; 0 for the
+            first members, which have none.
+    """
+
+    group: Tensor
+    first: Tensor
+    slot: Tensor
+
+    @classmethod
+    def of(cls, groups: Tensor | Sequence[int]) -> MuscleGroups:
+        """From the number of each muscle's group.
+
+        Examples:
+            >>> MuscleGroups.of([0, 1, 0, 0]).slot
+            tensor([0, 0, 1, 2])
+        """
+        group = torch.as_tensor(groups)
+        count = int(group.max()) + 1 if group.numel() else 0
+        if group.ndim != 1 or group.is_floating_point() or set(group.tolist()) != {*range(count)}:
+            raise ValueError(
+                f"groups is {group.tolist()}; it must give each muscle the number of its group, "
+                "with every number from 0 to the largest in use."
+            )
+        first = torch.tensor([group.tolist().index(number) for number in range(count)])
+        others = torch.ones_like(group).index_fill(0, first, 0)
+        return cls(group.long(), first, (others * others.cumsum(0)).long())
+
+    @property
+    def num_groups(self) -> int:
+        return len(self.first)
+
+    @property
+    def num_muscles(self) -> int:
+        return len(self.group)
+
+
+class GroupedTanhNormal(D.Distribution):
+    """Tanh-Gaussian over k groups of n muscles; every member follows its group.
+
+    Where bounds are [-1, 1], a muscle's action is its group's, y, times a weight: 1 for the group's
+    first member, w = 1 + clip(0.1 tanh(v), ±amplitude), v ~ N(weight_loc, weight_scale²), for the
+    others, clamped to the bounds.
+
+    The log-probability is that of y alone, which the first members hold: the density of a
+    distribution on k dimensions, not on n.
+
+    Args:
+        loc, scale (Tensor): of the groups [*, k], before the tanh.
+        weight_loc (Tensor): mean of v [*, n - k], for members that are not first, in their order.
+        amplitude (Tensor): largest deviation of a weight from 1 [*, 1], in [0, 0.1].
+
+    Keyword Args:
+        groups (MuscleGroups, Tensor or sequence of int): number of each muscle's group [n].
+        low, high (float or Tensor): bounds, one number or [n]. Default: ±1.
+        weight_scale (float): standard deviation of v. Default: e^0.5.
+
+    Raises:
+        ValueError: if group numbers are not 0, 1, ..., k - 1.
+
+    Examples:
+        >>> import torch
+        >>> grouped = GroupedTanhNormal(
+        ...     torch.zeros(2), torch.ones(2), torch.zeros(1), torch.zeros(1), groups=[0, 1, 0]
+        ... )
+        >>> action = grouped.sample()
+        >>> bool(action[0] == action[2]), bool(action[0] == action[1])
+        (True, False)
+    """
+
+    arg_constraints: dict = {}  # noqa: RUF012  (torch declares it so)
+    has_rsample = True
+
+    def __init__(
+        self,
+        loc: Tensor,
+        scale: Tensor,
+        weight_loc: Tensor,
+        amplitude: Tensor,
+        *,
+        groups: MuscleGroups | Tensor | Sequence[int],
+        low: float | Tensor = -1.0,
+        high: float | Tensor = 1.0,
+        weight_scale: float = math.exp(0.5),
+    ) -> None:
+        groups = groups if isinstance(groups, MuscleGroups) else MuscleGroups.of(groups)
+        self.groups = MuscleGroups(*(index.to(loc.device) for index in groups))
+        self.low, self.high = (
+            torch.as_tensor(bound, dtype=loc.dtype, device=loc.device).expand(groups.num_muscles)
+            for bound in (low, high)
+        )
+        first = self.groups.first
+        self.group_normal = TanhNormal(loc, scale, low=self.low[first], high=self.high[first])
+        self.weight_loc, self.weight_scale, self.amplitude = weight_loc, weight_scale, amplitude
+        super().__init__(loc.shape[:-1], self.low.shape, validate_args=False)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        return self.rsample_and_log_prob(sample_shape)[0]
+
+    def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too."""
+        shared, log_prob = self.group_normal.rsample_and_log_prob(torch.Size(sample_shape))
+        noise = torch.randn_like(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
+        return self._spread(shared, self.weight_loc + self.weight_scale * noise), log_prob
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.group_normal.log_prob(value.index_select(-1, self.groups.first))
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The action [*, n] where all Gaussians are at their means."""
+        return self._spread(self.group_normal.deterministic_sample, self.weight_loc)
+
+    def _spread(self, shared: Tensor, weight: Tensor) -> Tensor:
+        """Actions [*, n] from the groups' [*, k] and v [*, n - k]."""
+        group, first, slot = self.groups
+        center, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        change = (_DEVIATION * weight.tanh()).clamp(-self.amplitude, self.amplitude)
+        change = torch.cat([change.new_zeros(*change.shape[:-1], 1), change], -1)
+        unit = (shared - center[first]) / half[first]
+        weighted = unit.index_select(-1, group) * (1 + change.index_select(-1, slot))
+        return (center + half * weighted).clamp(self.low, self.high)
+
+
+class DynSynNetwork(nn.Module):
+    """What a DynSyn actor computes: the parameters of :class:`GroupedTanhNormal`.
+
+    Equation: amplitude(t) = clip(slope (t - start), 0, ceiling), with t in frames.
+
+    Args:
+        layers (nn.Sequential): with k + n outputs.
+        groups (MuscleGroups): of the n muscles.
+
+    Keyword Args:
+        slope, start, ceiling (float): see the equation.
+    """
+
+    def __init__(
+        self,
+        layers: nn.Sequential,
+        groups: MuscleGroups,
+        *,
+        slope: float,
+        start: int,
+        ceiling: float,
+    ) -> None:
+        super().__init__()
+        self.layers = layers
+        self.normal = NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3)
+        self.sizes = (2 * groups.num_groups, groups.num_muscles - groups.num_groups)
+        self.slope, self.start, self.ceiling = slope, start, ceiling
+        # A buffer: the workers' amplitude then rises with the weights that they are sent.
+        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+
+    @property
+    def amplitude(self) -> Tensor:
+        """Largest deviation of a weight from 1, at this time []."""
+        return (self.slope * (self.frames - self.start)).clamp(0, self.ceiling)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        group, weight_loc = self.layers(*inputs).split(self.sizes, -1)
+        loc, scale = self.normal(group)
+        amplitude = self.amplitude.to(loc).expand(*loc.shape[:-1], 1)
+        return loc, scale, weight_loc, amplitude
+
+
+def make_dynsyn_actor(
+    inputs: Mapping[NestedKey, int],
+    action_spec: TensorSpec,
+    groups: Tensor | Sequence[int],
+    *,
+    out_key: NestedKey = "action",
+    body: Body = "mlp",
+    hidden: Sequence[int] = (256, 256),
+    layer_norm: bool = True,
+    slope: float = 5e-8,
+    start: int = 1_000_000,
+    ceiling: float = 0.1,
+) -> ProbabilisticActor:
+    """Actor that moves muscles in groups, and learns to tell their members apart later on.
+
+    At first members of a group move as one. From ``start`` frames on, :func:`set_frames` lets their
+    weights deviate: by at most 10 % at 3,000,000 frames, with the defaults.
+
+    Its log-probability counts k dimensions, so SAC's target entropy should as well.
+
+    Deviates: the last layer starts small, as in :func:`~torchrl_etl.modules.make_actor`, and its
+    mapping to scales is the one used there; the original is an ordinary SAC's.
+
+    Args:
+        inputs (mapping of NestedKey to int): keys that the actor reads, with their sizes.
+        action_spec (TensorSpec): one unbatched bounded leaf, of n muscles.
+        groups (Tensor or sequence of int): number of each muscle's group [n], of
+            :func:`~torchrl_etl.baselines.muscle_groups.group_muscles`.
+
+    Keyword Args:
+        out_key (NestedKey): where the sample goes. Default: ``"action"``.
+        body, hidden, layer_norm: as in :func:`~torchrl_etl.modules.make_actor`.
+        slope, start, ceiling (float): of the amplitude, see :class:`DynSynNetwork`.
+
+    Keys:
+        reads ``inputs``; writes ``loc``, ``scale`` [*, k], ``weight_loc`` [*, n - k], ``amplitude``
+        [*, 1] and ``out_key`` [*, n] within the bounds.
+
+    Raises:
+        ValueError: if groups are not of n muscles or skip a number, or if slope is negative or
+            ceiling is outside [0, 0.1].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> actor = make_dynsyn_actor({"observation": 7}, Bounded(0, 1, shape=(4,)), [0, 1, 1, 0])
+        >>> action = actor(TensorDict({"observation": torch.randn(3, 7)}, [3]))["action"]
+        >>> torch.equal(action[:, 0], action[:, 3])
+        True
+        >>> set_frames(actor, 2_000_000)
+        >>> actor[0].module.amplitude
+        tensor(0.0500)
+    """
+    groups = MuscleGroups.of(groups)
+    n = action_spec.shape[-1]
+    if groups.num_muscles != n:
+        raise ValueError(
+            f"groups are of {groups.num_muscles} muscles but the action has {n}; use groups that "
+            "were found on this body."
+        )
+    if slope < 0 or not 0 <= ceiling <= _DEVIATION:
+        raise ValueError(
+            f"slope is {slope} and ceiling is {ceiling}; the amplitude may not fall, and weights "
+            f"deviate by {_DEVIATION} at most."
+        )
+    layers = make_layers(sum(inputs.values()), groups.num_groups + n, body, hidden, layer_norm)
+    with torch.no_grad():
+        layers[-1].weight.mul_(0.01)
+        layers[-1].bias.zero_()
+    network = DynSynNetwork(layers, groups, slope=slope, start=start, ceiling=ceiling)
+    parameters = ["loc", "scale", "weight_loc", "amplitude"]
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=list(inputs), out_keys=parameters),
+        in_keys=parameters,
+        out_keys=[out_key],
+        spec=action_spec,
+        distribution_class=GroupedTanhNormal,
+        distribution_kwargs={
+            "groups": groups,
+            "low": action_spec.space.low,
+            "high": action_spec.space.high,
+        },
+        default_interaction_type=InteractionType.RANDOM,
+    )
+
+
+def set_frames(actor: nn.Module, frames: int) -> None:
+    """Tell the DynSyn actors in a module how many frames were collected up to now.
+
+    Raises:
+        ValueError: if there is no such actor.
+
+    Examples:
+        >>> set_frames(nn.Linear(2, 2), 10)
+        Traceback (most recent call last):
+        ...
+        ValueError: There is no DynSyn actor in this Linear; make one with make_dynsyn_actor.
+    """
+    networks = [module for module in actor.modules() if isinstance(module, DynSynNetwork)]
+    if not networks:
+        raise ValueError(
+            f"There is no DynSyn actor in this {type(actor).__name__}; make one with "
+            "make_dynsyn_actor."
+        )
+    for network in networks:
+        network.frames.fill_(frames)

@@ -1,0 +1,381 @@
+"""EME (Wang 2024), what it learns: a metric that also compares policies, and a reward ensemble."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    dispatch,
+)
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+from torchrl.modules import MLP
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import distance_loss
+
+from torchrl_etl import functional
+from torchrl_etl.modules.checks import check_choice, check_positive
+from torchrl_etl.objectives.checks import check_parts
+
+__all__ = ["EMELoss", "RewardEnsemble", "diversity_scale"]
+
+
+def diversity_scale(predictions: Tensor, maximum: float = 10.0) -> Tensor:
+    r"""EME's scaling factor: how much an ensemble disagrees on the reward, kept in ``[1, M]``.
+
+    .. math:: \min(\max(\mathrm{Var}_k\, \hat r_k(s, a),\, 1),\, M)
+
+    Args:
+        predictions (Tensor): what each member predicts, ``[*, K]``.
+        maximum (float, optional): M, at least 1. Defaults to ``10.0``.
+
+    Returns:
+        Tensor: factors, ``[*, 1]``.
+
+    Deviates: which variance is not said; this is the population's (divided by K).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.baselines.eme import diversity_scale
+        >>> diversity_scale(torch.tensor([[0.0, 1.0], [0.0, 4.0], [0.0, 10.0]])).flatten()
+        tensor([ 1.,  4., 10.])
+    """
+    return predictions.var(-1, correction=0, keepdim=True).clamp(1.0, maximum)
+
+
+class _Members(nn.ModuleList):
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        inputs = torch.cat([observation, action], -1)
+        return torch.cat([member(inputs) for member in self], -1)
+
+
+class RewardEnsemble(TensorDictModule):
+    """Reward predictors r̂_k(s, a), each with an initialisation of its own.
+
+    Args:
+        observation_dim (int): size O of the observation.
+        action_dim (int): number n of actuators.
+        size (int): members K. With one the variance is zero and EME's scale always 1.
+            Default: ``6``.
+
+    Keyword Args:
+        hidden (sequence of int): widths of the hidden layers. Default: ``(256, 256)``.
+        in_keys (sequence of NestedKey): observation and action, in this order.
+        out_keys (sequence of NestedKey): the predictions.
+
+    Keys:
+        reads ``observation`` [*, O] and ``action`` [*, n]; writes ``reward_prediction`` [*, K] in
+        units of the reward.
+
+    Raises:
+        ValueError: if a size is not positive.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.baselines.eme import RewardEnsemble
+        >>> ensemble = RewardEnsemble(observation_dim=7, action_dim=5)
+        >>> data = TensorDict({"observation": torch.randn(3, 7), "action": torch.randn(3, 5)}, [3])
+        >>> ensemble(data)["reward_prediction"].shape
+        torch.Size([3, 6])
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        size: int = 6,
+        *,
+        hidden: Sequence[int] = (256, 256),
+        in_keys: Sequence[NestedKey] = ("observation", "action"),
+        out_keys: Sequence[NestedKey] = ("reward_prediction",),
+    ) -> None:
+        check_positive(observation_dim=observation_dim, action_dim=action_dim, size=size)
+        members = _Members(
+            MLP(observation_dim + action_dim, 1, num_cells=list(hidden), activation_class=nn.ReLU)
+            for _ in range(size)
+        )
+        super().__init__(members, in_keys=list(in_keys), out_keys=list(out_keys))
+
+
+class EMELoss(LossModule):
+    r"""Loss that trains EME's metric, as distances of state embeddings, and its reward ensemble.
+
+    Every transition is paired with one other of the batch. The distance of their embeddings is
+    pulled to their reward difference, plus ``gamma`` times how far apart their next states are,
+    plus how differently the policy acts in them. Both networks make up the bonus of
+    :class:`~torchrl_etl.baselines.eme_bonus.EMEBonus`.
+
+    Equation: ``d(s_i, s_j) = |r_i - r_j| + gamma d(s'_i, s'_j) + KL(pi_i ‖ pi_j)``, regressed with
+    the right side held fixed; each member of the ensemble regresses the reward.
+
+    Keys:
+        reads the ``in_keys`` of encoder, actor and ensemble (``observation`` [*, O] and ``action``
+        [*, n]), those of the encoder below ``"next"``, ``("next", "reward")`` [*, 1] and
+        ``("next", "terminated")`` [*, 1] bool. Writes
+
+        - ``loss_metric``: error of the distances;
+        - ``loss_reward_ensemble``: squared error of the predictions, mean over members;
+        - ``mean_distance``, ``mean_reward_difference``, ``mean_policy_divergence`` (nats): over the
+          pairs, detached;
+        - ``mean_reward_variance``: between the members, before EME's scale bounds it, detached;
+        - ``effective_rank``: of the embeddings, detached; near 1 means one used dimension.
+
+    Deviates:
+        - The public code never trains the metric, and PPO is its learner; this is the paper's
+          metric, made for any learner with a Gaussian policy below a tanh (SAC).
+        - d is the L2 distance of embeddings, hence symmetric and zero for a state with itself,
+          which a free network of both states would not be. KL is not symmetric: since a pair is
+          as likely drawn either way round, d settles between KL(pi_i ‖ pi_j) and
+          KL(pi_j ‖ pi_i).
+        - The next states' distance comes from a target encoder, and all terminated next states
+          are one absorbing state at the origin, as in
+          :class:`~torchrl_etl.objectives.BehavioralMetricLoss`: EME is compared with ETL, so what
+          is not EME's own idea is done as ETL does it.
+        - The error is smooth-L1, since the divergence of nearly deterministic policies runs to
+          hundreds of nats; ``loss_function="l2"`` is the squared error.
+        - ``policy_weight=gamma`` and ``reward_difference="corrected"``, which takes the members'
+          variances of both rewards off the squared difference, are how other rebuilders of EME
+          read its regression target.
+
+    Args:
+        encoder (TensorDictModule): φ; its first out key is the embedding [*, k].
+        ensemble (TensorDictModule): the reward predictors, such as :class:`RewardEnsemble`; its
+            first out key holds one prediction for each member [*, K].
+        actor (ProbabilisticTensorDictSequential): the policy that is being learned. It is held by
+            reference: it gets no gradient, and neither ``parameters()`` nor ``state_dict()`` of
+            the loss contain it.
+
+    Keyword Args:
+        gamma (float): discount factor in [0, 1). Default: ``0.95``.
+        policy_weight (float): weight of the policies' divergence. Default: ``1.0``.
+        reward_difference (str): ``"sampled"`` or ``"corrected"``. Default: ``"sampled"``.
+        loss_function (str): ``"smooth_l1"`` or ``"l2"``, of the distances.
+            Default: ``"smooth_l1"``.
+        subset_share (float): in (0, 1]; each member learns on its own random subset of every batch,
+            of this expected share. Members differ by initialisation anyway. Default: ``0.8``.
+        policy_keys (pair of NestedKey): where the actor writes mean and standard deviation of the
+            Gaussian. Default: ``("loc", "scale")``.
+        delay_encoder (bool): keep a separate target encoder, for ``SoftUpdate`` to move. Without
+            it the target is the present encoder, detached. Default: ``True``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default: ``"mean"``.
+
+    Raises:
+        ValueError: at construction for an unknown choice, a number out of range, or an actor that
+            does not write ``policy_keys``; in ``forward`` for a batch of one sample, which has no
+            pairs.
+        TypeError: if a network is not a TensorDict module, or the actor not a probabilistic one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble
+        >>> from torchrl_etl.modules import StateEncoder, make_actor
+        >>> actor = make_actor({"observation": 7}, Bounded(-1, 1, shape=(5,)))
+        >>> loss = EMELoss(StateEncoder(7, 4), RewardEnsemble(7, 5), actor)
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> entries = {"observation": torch.randn(32, 7), "action": torch.rand(32, 5)}
+        >>> batch = TensorDict(entries, [32])
+        >>> batch["next"] = {
+        ...     "observation": torch.randn(32, 7),
+        ...     "reward": torch.randn(32, 1),
+        ...     "terminated": torch.zeros(32, 1, dtype=torch.bool),
+        ... }
+        >>> out = loss(batch)
+        >>> (out["loss_metric"] + out["loss_reward_ensemble"]).backward()
+        >>> updater.step()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that :meth:`set_keys` can change; both are read below ``"next"``.
+
+        Attributes:
+            reward (NestedKey): the task's own reward. Default: ``"reward"``.
+            terminated (NestedKey): end of the episode in a terminal state.
+                Default: ``"terminated"``.
+        """
+
+        reward: NestedKey = "reward"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    encoder: TensorDictModuleBase
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    ensemble: TensorDictModuleBase
+    ensemble_params: TensorDictParams
+    target_ensemble_params: TensorDictParams
+
+    def __init__(
+        self,
+        encoder: TensorDictModuleBase,
+        ensemble: TensorDictModuleBase,
+        actor: ProbabilisticTensorDictSequential,
+        *,
+        gamma: float = 0.95,
+        policy_weight: float = 1.0,
+        reward_difference: Literal["sampled", "corrected"] = "sampled",
+        loss_function: Literal["smooth_l1", "l2"] = "smooth_l1",
+        subset_share: float = 0.8,
+        policy_keys: Sequence[NestedKey] = ("loc", "scale"),
+        delay_encoder: bool = True,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        check_choice("reward_difference", reward_difference, ("sampled", "corrected"))
+        check_choice("loss_function", loss_function, ("smooth_l1", "l2"))
+        check_choice("reduction", reduction, ("mean", "sum", "none"))
+        check_parts("encoder", encoder, TensorDictModuleBase, outputs=1)
+        check_parts("ensemble", ensemble, TensorDictModuleBase, outputs=1)
+        check_parts("actor", actor, ProbabilisticTensorDictSequential)
+        policy_keys = [unravel_key(key) for key in policy_keys]
+        if len(policy_keys) != 2 or not set(policy_keys) <= set(actor.out_keys):
+            raise ValueError(
+                f"policy_keys is {policy_keys} but the actor writes {list(actor.out_keys)}; name "
+                "the two keys of its Gaussian's mean and standard deviation."
+            )
+        if not 0.0 <= gamma < 1.0:
+            raise ValueError(f"gamma is {gamma}; it must be in [0, 1) for distances to be finite.")
+        if policy_weight < 0.0:
+            raise ValueError(f"policy_weight is {policy_weight}; it must not be negative.")
+        if not 0.0 < subset_share <= 1.0:
+            raise ValueError(f"subset_share is {subset_share}; it must be above 0, and at most 1.")
+
+        super().__init__()
+        self.gamma, self.policy_weight, self.subset_share = gamma, policy_weight, subset_share
+        self.reward_difference, self.loss_function = reward_difference, loss_function
+        self.reduction, self.policy_keys = reduction, policy_keys
+        # In a tuple the actor is no part of the loss: whoever trains, saves, casts or resets the
+        # loss leaves it alone.
+        self._actor = (actor,)
+        self.convert_to_functional(encoder, "encoder", create_target_params=delay_encoder)
+        self.convert_to_functional(ensemble, "ensemble")
+        self._set_in_keys()
+        self.out_keys = [
+            "loss_metric",
+            "loss_reward_ensemble",
+            "mean_distance",
+            "mean_reward_difference",
+            "mean_policy_divergence",
+            "mean_reward_variance",
+            "effective_rank",
+        ]
+
+    @property
+    def actor(self) -> ProbabilisticTensorDictSequential:
+        """The actor given at construction, not a copy."""
+        return self._actor[0]
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        following = (*self.encoder.in_keys, keys.reward, keys.terminated)
+        parts = (self.encoder, self.actor, self.ensemble)
+        # Several parts read the observation: a dictionary keeps each key once, and the order.
+        present = dict.fromkeys(key for part in parts for key in part.in_keys)
+        self.in_keys = [*present, *(unravel_key(("next", key)) for key in following)]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses of one batch of transitions.
+
+        Args:
+            tensordict (TensorDictBase): transitions with any batch size; left unchanged.
+
+        Returns:
+            TensorDictBase: the entries named under ``Keys``.
+        """
+        following = tensordict.get("next")
+        reward = following.get(self.tensor_keys.reward)
+        batch_size = reward.shape[:-1]
+        reward = reward.detach().flatten()
+        partner = _partners(reward.numel(), reward.device)
+
+        embedding = _apply(self.encoder, self.encoder_params, tensordict)
+        predictions = _apply(self.ensemble, self.ensemble_params, tensordict)
+        with torch.no_grad():
+            next_embedding = _apply(self.encoder, self.target_encoder_params, following)
+            ended = following.get(self.tensor_keys.terminated).reshape(-1, 1)
+            next_embedding = next_embedding.masked_fill(ended, 0.0)
+            loc, scale = self._gaussian(tensordict, like=embedding)
+            divergence = functional.gaussian_kl(loc, scale, loc[partner], scale[partner])
+            variance = predictions.var(-1, correction=0)
+            difference = self._difference(reward, variance, partner)
+            target = (
+                difference
+                + self.gamma * functional.l2_distance(next_embedding, next_embedding[partner])
+                + self.policy_weight * divergence
+            )
+
+        distance = functional.l2_distance(embedding, embedding[partner])
+        error = (predictions - reward.unsqueeze(-1)).square()
+        if self.subset_share < 1.0:
+            drawn = torch.rand_like(error) < self.subset_share
+            error = error * drawn / self.subset_share
+        out = {
+            "loss_metric": distance_loss(distance, target, self.loss_function),
+            "loss_reward_ensemble": error.mean(-1),
+        }
+        reduced = {
+            key: self._reduce_loss(value.reshape(batch_size), tensordict)
+            for key, value in out.items()
+        }
+        return TensorDict(
+            reduced
+            | {
+                "mean_distance": distance.detach().mean(),
+                "mean_reward_difference": difference.mean(),
+                "mean_policy_divergence": divergence.mean(),
+                "mean_reward_variance": variance.mean(),
+                "effective_rank": functional.effective_rank(embedding.detach()),
+            }
+        )
+
+    def _difference(self, reward: Tensor, variance: Tensor, partner: Tensor) -> Tensor:
+        """How far the rewards of each pair lie apart [samples]."""
+        difference = (reward - reward[partner]).abs()
+        if self.reward_difference == "corrected":
+            noise = variance + variance[partner]
+            difference = (difference.square() - noise).clamp_min(0.0).sqrt()
+        return difference
+
+    def _gaussian(self, tensordict: TensorDictBase, like: Tensor) -> list[Tensor]:
+        """Mean and standard deviation [samples, n] of the actor below its tanh.
+
+        The divergence of two Gaussians is that of their images under one invertible map, so the
+        tanh and the bounds of the action do not matter.
+        """
+        inputs = tensordict.select(*self.actor.in_keys)
+        # The loss may have been cast without the actor.
+        parameter = next(self.actor.parameters(), like)
+        inputs = inputs.to(parameter.device, parameter.dtype)
+        written = self.actor.get_dist_params(inputs)
+        return [written.get(key).flatten(0, -2).to(like) for key in self.policy_keys]
+
+
+def _partners(samples: int, device: torch.device) -> Tensor:
+    """Index [samples] of the other transition that each one is compared with."""
+    if samples < 2:
+        raise ValueError("The batch holds one transition; distances need at least two.")
+    # Neighbors on a random circle: a random permutation that maps no sample to itself.
+    order = torch.randperm(samples, device=device)
+    return torch.empty_like(order).scatter_(0, order, order.roll(1))
+
+
+def _apply(
+    network: TensorDictModuleBase, params: TensorDictParams, tensordict: TensorDictBase
+) -> Tensor:
+    """A network's first output [samples, size] with these parameters."""
+    with params.to_module(network, preserve_module_state=False):
+        written = network(tensordict.select(*network.in_keys))
+    return written.get(network.out_keys[0]).flatten(0, -2)

@@ -1,0 +1,152 @@
+"""Which muscles belong together, found from how their lengths vary (He 2024, DynSyn)."""
+
+from __future__ import annotations
+
+import kmedoids
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, step_mdp
+
+from torchrl_etl.envs import mujoco_state
+from torchrl_etl.modules.checks import check_positive
+
+__all__ = ["group_muscles", "record_muscle_lengths"]
+
+
+def record_muscle_lengths(
+    env: EnvBase, frames: int, *, amplitude: float, every: int = 10, seed: int = 0
+) -> Tensor:
+    """Lengths of a body's actuators while its joints are thrown about.
+
+    Every few steps the velocity of each joint is drawn from U(-1, 1)·amplitude; the action is zero
+    throughout. A root or an object that floats freely gets no velocity: what it does says nothing
+    about muscles.
+
+    Deviates: free joints are held still; the original lets legs rise at 0.1 m/s and moves objects
+    away. Episodes end where the environment ends them. The original records 500,000 frames.
+
+    Args:
+        env (EnvBase): of :func:`~torchrl_etl.envs.make_env`, on MuJoCo, with one simulator. It is
+            seeded and reset.
+        frames (int): number of steps.
+
+    Keyword Args:
+        amplitude (float): largest velocity, in rad/s. The original takes 10 for legs and 100 for
+            hands.
+        every (int): steps between draws. Default: 10.
+        seed (int): of the environment and the velocities. Default: 0.
+
+    Returns:
+        Tensor: [frames, n], in the simulator's units (metres, for muscles).
+
+    Raises:
+        ValueError: for several simulators, one that is not MuJoCo, or sizes that are not positive.
+
+    Examples:
+        >>> from torchrl_etl.envs import make_env
+        >>> env = make_env("cartpole-balance")
+        >>> record_muscle_lengths(env, 20, amplitude=1.0).shape
+        torch.Size([20, 1])
+    """
+    check_positive(frames=frames, every=every)
+    if not amplitude > 0:
+        raise ValueError(f"amplitude is {amplitude}; it is a largest velocity and must be above 0.")
+    if env.batch_size:
+        raise ValueError(
+            f"The environment has batch size {list(env.batch_size)}; muscle lengths are recorded "
+            "from one simulator, so build it with num_envs=1."
+        )
+    env.set_seed(seed)
+    rng = np.random.default_rng(seed)
+    data: TensorDictBase = env.reset()
+    rest = env.full_action_spec[env.action_key].zero()
+    model, state = mujoco_state(env)
+    floating = _floating(model)
+    lengths = np.empty((frames, model.nu), dtype=np.float32)
+    for frame in range(frames):
+        if frame % every == 0:
+            state.qvel[:] = amplitude * rng.uniform(-1, 1, model.nv)
+        state.qvel[floating] = 0
+        data = env.step(data.set(env.action_key, rest.clone()))
+        lengths[frame] = state.actuator_length
+        data = env.reset() if data["next", "done"].any() else step_mdp(data)
+    return torch.from_numpy(lengths)
+
+
+def group_muscles(
+    lengths: Tensor, num_groups: int, *, chunk: int = 100, restarts: int = 20, seed: int = 0
+) -> Tensor:
+    """Groups of muscles whose lengths vary alike.
+
+    Each muscle's length is scaled to [0, 1] over the recording. In each chunk of it two muscles are
+    compared by the cosine of their lengths, not centred; one minus its mean over chunks, at least
+    zero, is their distance, and k-medoids on these distances gives the groups.
+
+    Deviates: of the restarts the one with the least loss is taken; the original takes the loss that
+    most of them reach. Frames after the last full chunk are left out.
+
+    Args:
+        lengths (Tensor): [frames, n], of :func:`record_muscle_lengths`.
+        num_groups (int): k ≤ n. The original takes 40 for 80 leg muscles, 25 for 39 of a hand.
+
+    Keyword Args:
+        chunk (int): frames in a chunk. Default: 100.
+        restarts (int): of k-medoids, from medoids drawn at random. Default: 20.
+        seed (int): of the first restart; the others count on. Default: 0.
+
+    Returns:
+        Tensor: group number of each muscle [n], int64; groups are numbered from 0 in the order of
+        their first members.
+
+    Raises:
+        ValueError: for lengths of another form, fewer frames than a chunk, more groups than
+            muscles, or a muscle whose length never changes.
+
+    Examples:
+        >>> import torch
+        >>> time = torch.linspace(0, 20, 400)
+        >>> fast, slow = (3 * time).sin(), time.cos()
+        >>> group_muscles(torch.stack([slow, fast, 2 * slow, 5 + fast], -1), 2)
+        tensor([0, 1, 0, 1])
+    """
+    check_positive(num_groups=num_groups, chunk=chunk, restarts=restarts)
+    if lengths.ndim != 2 or len(lengths) < chunk or num_groups > lengths.shape[1]:
+        raise ValueError(
+            f"lengths has shape {tuple(lengths.shape)}; {num_groups} groups from chunks of {chunk} "
+            f"frames need [frames, muscles] with at least {chunk} frames and {num_groups} muscles."
+        )
+    lengths = lengths.double().cpu()
+    low, high = lengths.amin(0), lengths.amax(0)
+    still = (high == low).nonzero().flatten().tolist()
+    if still:
+        raise ValueError(
+            f"The length of muscle {', '.join(map(str, still))} never changes; record more frames "
+            "or a larger amplitude."
+        )
+    chunks = ((lengths - low) / (high - low)).unfold(0, chunk, chunk)  # [chunks, n, frames]
+    chunks = torch.nn.functional.normalize(chunks, dim=-1)
+    similarity = (chunks @ chunks.mT).mean(0)
+    distance = (1 - similarity).clamp_min(0).numpy()
+    runs = (
+        kmedoids.fasterpam(distance, num_groups, init="random", random_state=seed + i, n_cpu=1)
+        for i in range(restarts)
+    )
+    return _numbered(min(runs, key=lambda run: run.loss).labels)
+
+
+def _numbered(labels: np.ndarray) -> Tensor:
+    """The same groups, numbered in the order of their first members."""
+    _, first, label = np.unique(labels, return_index=True, return_inverse=True)
+    return torch.from_numpy(first.argsort().argsort()[label]).long()
+
+
+def _floating(model: mujoco.MjModel) -> np.ndarray:
+    """Which velocities [nv] belong to joints that leave a body free."""
+    floating = np.zeros(model.nv, dtype=bool)
+    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+    for start in model.jnt_dofadr[free]:
+        floating[start : start + 6] = True
+    return floating

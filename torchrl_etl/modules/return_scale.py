@@ -1,0 +1,83 @@
+"""Rewards in units of the returns that they add up to."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["ReturnScale"]
+
+
+class ReturnScale(nn.Module):
+    """Divides rewards so that returns deviate by about one and stay within a bound.
+
+    Per simulator it follows the discounted sum of the rewards so far, G_t = r_t + γ G_{t-1}, zero
+    where an episode begins. The scale is max(std(G), max|G| / bound) over all that was seen.
+
+    Equation: the reward scaling of FlashSAC (2026); the first term is that of Engstrom 2020.
+
+    Args:
+        gamma (float): discount factor γ in [0, 1).
+
+    Keyword Args:
+        bound (float): largest return, in scaled units. Default: 5.
+
+    Raises:
+        ValueError: if γ is outside [0, 1) or the bound is not above 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.modules import ReturnScale
+        >>> scale = ReturnScale(gamma=0.5, bound=1.0)
+        >>> scale.update(torch.tensor([[4.0, 4.0]]), torch.tensor([[False, False]]))
+        >>> scale(torch.tensor([3.0]))  # the largest return so far is 4 + 0.5 * 4
+        tensor([0.5000])
+    """
+
+    def __init__(self, gamma: float, *, bound: float = 5.0) -> None:
+        super().__init__()
+        if not 0.0 <= gamma < 1.0:
+            raise ValueError(f"gamma is {gamma}; it is a discount factor and must lie in [0, 1).")
+        if not bound > 0.0:
+            raise ValueError(f"bound is {bound}; it is the largest return and must be above 0.")
+        self.gamma, self.bound = gamma, bound
+        for name in ("count", "mean", "squares", "largest"):
+            self.register_buffer(name, torch.zeros((), dtype=torch.float64))
+        self.forget()
+
+    def forget(self) -> None:
+        """All episodes begin anew; what was seen of earlier ones stays in the scale."""
+        self._sums: Tensor | None = None
+
+    @torch.no_grad()
+    def update(self, reward: Tensor, done: Tensor) -> None:
+        """See a batch [simulators, time], the same simulators in the same order every time."""
+        reward = reward.to(self.mean)
+        sums = self._sums if self._sums is not None else torch.zeros_like(reward[:, 0])
+        seen = []
+        for now, ends in zip(reward.unbind(1), done.unbind(1), strict=True):
+            seen.append(now + self.gamma * sums)
+            sums = torch.where(ends, 0.0, seen[-1])
+        self._sums = sums
+        self._see(torch.stack(seen))
+
+    def _see(self, values: Tensor) -> None:
+        # Chan's parallel variance: exact, whatever the batches are.
+        count, mean = self.count + values.numel(), values.mean()
+        squares = (values - mean).square().sum()
+        shift = mean - self.mean
+        self.squares += squares + shift.square() * self.count * values.numel() / count
+        self.mean += shift * values.numel() / count
+        self.count.copy_(count)
+        self.largest.copy_(torch.maximum(self.largest, values.abs().max()))
+
+    @property
+    def scale(self) -> Tensor:
+        """What rewards are divided by; one before anything was seen."""
+        std = (self.squares / self.count.clamp(min=1)).sqrt()
+        scale = torch.maximum(std, self.largest / self.bound)
+        return torch.where(scale > 1e-8, scale, 1.0)
+
+    def forward(self, reward: Tensor) -> Tensor:
+        """Rewards of any shape in scaled units."""
+        return reward / self.scale.to(reward.dtype)

@@ -1,0 +1,211 @@
+"""A queue of runs that can be killed at any time and started again."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import io
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from omegaconf import OmegaConf
+
+from torchrl_etl.modules.atomic_files import write_atomically
+from torchrl_etl.training.run_folder import RunFolder
+
+__all__ = ["COLUMNS", "Bench", "Run"]
+
+COLUMNS = (
+    *("task", "goal", "method", "seed", "frames", "return", "solved", "solved_time"),
+    *("episodes", "wall_seconds", "commit", "versions", "machine", "status"),
+)
+RESULTS = "results.csv"
+
+
+@dataclass
+class Run:
+    """One method on one task with one seed, in a folder of its own.
+
+    Attributes:
+        task, goal, method, seed: what is run; ``goal`` may be ``None``.
+        path (Path): its run folder.
+        command (sequence of str): begins the run, without ``run_dir``.
+    """
+
+    task: str
+    goal: str | None
+    method: str
+    seed: int
+    path: Path
+    command: Sequence[str] = field(repr=False)
+    process: subprocess.Popen | None = field(default=None, repr=False)
+    starts: int = 0
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def is_finished(self) -> bool:
+        return (self.path / "summary.json").is_file()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a process works in its folder, perhaps one of an earlier queue."""
+        return self.path.is_dir() and RunFolder.is_locked(self.path)
+
+    @property
+    def folder(self) -> RunFolder | None:
+        config = self.path / "config.yaml"
+        return RunFolder(self.path, OmegaConf.load(config)) if config.is_file() else None
+
+    def start(self, environ: Mapping[str, str]) -> None:
+        """Begin, or go on where an earlier start was stopped."""
+        self.starts += 1
+        begun = (self.path / "config.yaml").is_file()
+        where = f"resume={self.path}" if begun else f"run_dir={self.path}"
+        script, *overrides = self.command
+        command = [sys.executable, script, where, *([] if begun else overrides)]
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / "log.txt").open("a", encoding="utf-8") as log:
+            # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=dict(environ),
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
+            )
+
+    def rows(self, status: str) -> Iterator[dict[str, Any]]:
+        """Its evaluations, oldest first."""
+        folder = self.folder
+        if folder is None or not (self.path / "versions.json").is_file():
+            return
+        facts = json.loads((self.path / "versions.json").read_text(encoding="utf-8"))[-1]
+        own = {"commit": facts.pop("commit"), "machine": facts.pop("machine")}
+        own |= {"versions": json.dumps(facts), "status": status}
+        own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
+        explored = folder.series("explore/wall_seconds")[1]
+        own["episodes"] = OmegaConf.load(self.path / "config.yaml").evaluation.episodes
+        series = {
+            key: dict(zip(*folder.series(f"learn/eval/{key}"), strict=True))
+            for key in ("return", "solved", "solved_time", "wall_seconds")
+        }
+        for frames in sorted(series["return"]):
+            row = own | {"frames": frames} | {k: v.get(frames) for k, v in series.items()}
+            if explored and row["wall_seconds"] is not None:
+                row["wall_seconds"] += explored[-1]
+            yield row
+
+
+class Bench:
+    """Runs a queue with several processes at a time and keeps one table of all evaluations.
+
+    A run that is finished is left alone, one that was begun goes on from its last checkpoint, one
+    that fails is tried again ``attempts`` times in all. However the queue itself ends, its runs
+    end with it or before.
+
+    Args:
+        runs (sequence of Run): what to run, in this order.
+        folder (path): holds the runs' folders and ``results.csv``.
+
+    Keyword Args:
+        jobs (int): processes at a time.
+        attempts (int): starts of one run, at most. Default: 3.
+
+    Raises:
+        RuntimeError: if another queue works in this folder.
+    """
+
+    def __init__(self, runs: Sequence[Run], folder: Path, *, jobs: int, attempts: int = 3) -> None:
+        self.runs, self.folder, self.jobs, self.attempts = runs, Path(folder), jobs, attempts
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(self.folder / ".lock")
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise RuntimeError(
+                f"Another queue works in {self.folder}; wait for it, or give another folder."
+            ) from None
+
+    def __iter__(self) -> Iterator[Sequence[Run]]:
+        """Work through the queue; yields about once a second, for a display."""
+        environ = os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+        written = -math.inf
+        try:
+            while True:
+                active = [run for run in self.runs if self.status(run) == "running"]
+                waiting = [run for run in self.runs if self.status(run) == "waiting"]
+                free = [run for run in waiting if not run.is_busy]
+                for run in free[: self.jobs - len(active)]:
+                    run.start(environ)
+                if time.monotonic() - written > 10:
+                    self.write()
+                    written = time.monotonic()
+                yield self.runs
+                if not active and not waiting:
+                    return
+                time.sleep(1.0)
+        finally:
+            self.stop()
+
+    def status(self, run: Run) -> str:
+        """waiting, running, finished, failed, or, of one not in this queue's hands, unfinished."""
+        if run.process is not None and run.process.poll() is None:
+            return "running"
+        if run.is_finished:
+            return "finished"
+        return "failed" if run.starts >= self.attempts else "waiting"
+
+    def stop(self) -> None:
+        """Ask what runs to save and end, wait for that, and write the table."""
+        active = [run.process for run in self.runs if self.status(run) == "running"]
+        for process in active:
+            process.send_signal(signal.SIGTERM)
+        for process in active:
+            try:
+                process.wait(120)
+            except subprocess.TimeoutExpired:
+                process.kill()
+        self.write()
+        self._lock.release()
+
+    def write(self) -> None:
+        """One row per evaluation of every run of the queue, and of others in the folder."""
+        rows = [row for run in self.runs for row in run.rows(self.status(run))]
+        mine = {(row["task"], row["goal"], row["method"], str(row["seed"])) for row in rows}
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows_of_others(mine))
+        writer.writerows(rows)
+        write_atomically(self.folder / RESULTS, text.getvalue())
+
+    def _rows_of_others(self, mine: set[tuple[Any, ...]]) -> list[dict[str, str]]:
+        path = self.folder / RESULTS
+        if not path.is_file():
+            return []
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        keys = ("task", "goal", "method", "seed")
+        return [row for row in rows if tuple(row[key] or None for key in keys) not in mine]
+
+
+def _end_with_parent() -> None:
+    """Let the kernel stop this process when the queue is killed; it then saves and ends."""
+    if sys.platform == "linux":
+        set_parent_death_signal = 1
+        ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)

@@ -1,0 +1,156 @@
+"""The stages of ETL's rivals: SAC as the control runs it, with one idea of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_etl.baselines import (
+    DEPExploration,
+    EMEBonus,
+    EMELoss,
+    LatticeNoise,
+    RewardEnsemble,
+    make_dynsyn_actor,
+    make_lattice_actor,
+    set_frames,
+)
+from torchrl_etl.modules import StateEncoder
+from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss
+from torchrl_etl.training.sac import SACStage
+from torchrl_etl.training.stage import entropy_target
+
+__all__ = ["DEPStage", "DynSynStage", "EMEStage", "LatticeStage"]
+
+
+class LatticeStage(SACStage):
+    """Lattice (Chiappa 2023): noise on the last hidden features, so that actuators move together.
+
+    Its noise is its own: ``sac.noise`` is not read.
+
+    Keyword Args:
+        lattice (mapping): ``state_dependent``, ``freq`` (steps between draws of the noise
+            matrices, where it is), and further arguments of
+            :func:`~torchrl_etl.baselines.make_lattice_actor`.
+        **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
+    """
+
+    def __init__(self, *args: Any, lattice: Mapping[str, Any], **sac_stage: Any) -> None:
+        self._lattice = dict(lattice)
+        self._freq = self._lattice.pop("freq")
+        super().__init__(*args, **sac_stage)
+
+    def build_actor(self, inputs: Any, spec: Bounded, **options: Any) -> ProbabilisticActor:
+        return make_lattice_actor(inputs, spec, **options, **self._lattice)
+
+    def exploring(self, noise: str) -> TensorDictModuleBase:
+        if self._lattice["state_dependent"]:
+            return LatticeNoise(self.actor, freq=self._freq)
+        return self.actor
+
+
+class DEPStage(SACStage):
+    """DEP (Schumacher 2023): now and then a controller of muscle lengths acts instead.
+
+    Deviates: its learner is MPO; here it is SAC, the same as everyone's.
+
+    Keyword Args:
+        dep (mapping): keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`.
+        **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`; ``make_env`` must give
+            ``muscle_length``.
+    """
+
+    def __init__(self, *args: Any, dep: Mapping[str, Any], **sac_stage: Any) -> None:
+        self._dep = dep
+        super().__init__(*args, **sac_stage)
+
+    def exploring(self, noise: str) -> TensorDictModuleBase:
+        controller = DEPExploration(self.action_spec, **self._dep)
+        return TensorDictSequential(super().exploring(noise), controller)
+
+
+class DynSynStage(SACStage):
+    """DynSyn (He 2024): muscles that move alike share one action.
+
+    Its actor's distribution is its own: ``sac.noise`` is not read.
+
+    Keyword Args:
+        groups (sequence of int): the group of each muscle.
+        dynsyn (mapping): further arguments of :func:`~torchrl_etl.baselines.make_dynsyn_actor`.
+        **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
+    """
+
+    def __init__(
+        self, *args: Any, groups: Sequence[int], dynsyn: Mapping[str, Any], **sac_stage: Any
+    ) -> None:
+        self._groups, self._dynsyn = list(groups), dynsyn
+        super().__init__(*args, **sac_stage)
+
+    def build_actor(self, inputs: Any, spec: Bounded, **options: Any) -> ProbabilisticActor:
+        return make_dynsyn_actor(inputs, spec, self._groups, **options, **self._dynsyn)
+
+    def exploring(self, noise: str) -> TensorDictModuleBase:
+        return self.actor
+
+    def target_entropy(self, action_std: float | None) -> float | str:
+        # The actor's log-probability counts one dimension a group.
+        first = [self._groups.index(group) for group in sorted(set(self._groups))]
+        if action_std is None:
+            return -float(len(first))
+        return entropy_target(self.action_spec[first], action_std)
+
+    def seen(self, batch: TensorDictBase) -> TensorDictBase:
+        set_frames(self.actor, self.frames)
+        return super().seen(batch)
+
+
+class EMEStage(SACStage):
+    """EME (Wang 2024): a bonus for steps that are long in a metric of reward and policy.
+
+    Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
+
+    Keyword Args:
+        eme (mapping): ``embedding_dim`` and ``hidden`` of the encoder, ``ensemble`` (its size),
+            ``lr``, ``tau`` (of the target encoder), ``weight`` and ``max_scale`` of the bonus.
+        **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
+    """
+
+    reward = "total_reward"
+
+    def __init__(self, *args: Any, eme: Mapping[str, Any], **sac_stage: Any) -> None:
+        self._eme = eme
+        super().__init__(*args, **sac_stage)
+        self.buffer.append_transform(
+            EMEBonus(self.encoder, self.ensemble, weight=eme["weight"], max_scale=eme["max_scale"])
+        )
+        self.targets = [*self.targets, FusedSoftUpdate(self.metric, tau=eme["tau"])]
+
+    def make_loss(self, critic: TensorDictModuleBase, **options: Any) -> LeanSACLoss:
+        observation_dim, action_dim = self.observation_dim, self.action_spec.shape[-1]
+        hidden = self._eme["hidden"]
+        self.encoder = StateEncoder(observation_dim, self._eme["embedding_dim"], hidden=hidden)
+        self.ensemble = RewardEnsemble(
+            observation_dim, action_dim, self._eme["ensemble"], hidden=hidden
+        )
+        self.metric = EMELoss(
+            self.encoder.to(self.device), self.ensemble.to(self.device), self.actor
+        ).to(self.device)
+        return super().make_loss(critic, **options)
+
+    def groups(self, lr: float) -> list[tuple[list[Tensor], float]]:
+        return [*super().groups(lr), (list(self.metric.parameters()), self._eme["lr"])]
+
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        loss, scalars = super().losses(batch)
+        metric = self.metric(batch)
+        scalars.update(metric).set("bonus", batch["next", "intrinsic_reward"].mean())
+        return loss + metric["loss_metric"] + metric["loss_reward_ensemble"], scalars
+
+    def parts(self) -> dict[str, Any]:
+        return {**super().parts(), "metric": self.metric}

@@ -1,0 +1,169 @@
+"""Soft actor-critic on the task: the control, and the frame that the other learners fill in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.envs import EnvBase
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_etl.modules import HeldNoise, ReturnScale, make_actor, make_critic
+from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.objectives import LeanSACLoss
+from torchrl_etl.training.stage import Stage, entropy_target, make_optimizer, ready_for_training
+
+__all__ = ["SACStage"]
+
+Noise = Literal["independent", "held"]
+Losses = tuple[Tensor, TensorDictBase]
+
+
+class SACStage(Stage):
+    """SAC on all actuators, with ETL's loop, networks, buffer and updates.
+
+    Args:
+        make_env (callable): environment to collect from.
+        spec (EnvBase): any instance of that environment, to read sizes and bounds from.
+
+    Keyword Args:
+        actor, critic (mapping): keyword arguments of :func:`~torchrl_etl.modules.make_actor` and
+            :func:`~torchrl_etl.modules.make_critic`.
+        sac (mapping): ``gamma``, ``tau``, ``lr``, ``alpha_init``, ``action_std`` (see
+            :func:`~torchrl_etl.training.stage.entropy_target`), ``return_bound`` (scale rewards as
+            :class:`~torchrl_etl.modules.ReturnScale` does; ``None``: as they are), ``noise``
+            ("independent" at every step or "held" for several).
+        **stage: see :class:`~torchrl_etl.training.stage.Stage`.
+
+    Raises:
+        ValueError: for categorical critics without a bound on returns.
+    """
+
+    name = "learn"
+    kept = ("observation", "action")
+    reward = "reward"
+
+    def __init__(
+        self,
+        make_env: Callable[[], EnvBase],
+        spec: EnvBase,
+        *,
+        actor: Mapping[str, Any],
+        critic: Mapping[str, Any],
+        sac: Mapping[str, Any],
+        device: torch.device,
+        **stage: Any,
+    ) -> None:
+        torch.manual_seed(stage["seed"])
+        check_choice("sac.noise", sac["noise"], get_args(Noise))
+        muscles = spec.full_action_spec_unbatched["action"].to(device)
+        self.observation_dim = spec.observation_spec["observation"].shape[-1]
+        inputs = {"observation": self.observation_dim}
+        self.action_spec, out_key = self.emitted(muscles)
+        self.actor = self.build_actor(inputs, self.action_spec, out_key=out_key, **actor).to(device)
+        value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
+        policy = self.policy_of(self.exploring(sac["noise"]))
+        super().__init__(make_env, policy, device=device, **stage)
+        bound = sac["return_bound"]
+        self.return_scale = None
+        if bound is not None:
+            self.return_scale = ReturnScale(sac["gamma"], bound=bound).to(device)
+        self.sac = self.make_loss(
+            value,
+            action_spec=self.action_spec,
+            target_entropy=self.target_entropy(sac["action_std"]),
+            alpha_init=sac["alpha_init"],
+            support=support(critic.get("bins", 1), bound),
+        ).to(device)
+        self.sac.set_keys(reward=self.reward)
+        self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
+        self.optimizer = make_optimizer(device, *self.groups(sac["lr"]))
+
+    # What other learners fill in ---------------------------------------------------------------
+
+    def emitted(self, muscles: Bounded) -> tuple[Bounded, str]:
+        """Bounds and key of what the actor emits."""
+        return muscles, "action"
+
+    def build_actor(self, inputs: Any, spec: Bounded, **options: Any) -> ProbabilisticActor:
+        return make_actor(inputs, spec, **options)
+
+    def exploring(self, noise: Noise) -> TensorDictModuleBase:
+        """The actor as it collects."""
+        return HeldNoise(self.actor) if noise == "held" else self.actor
+
+    def target_entropy(self, action_std: float | None) -> float | str:
+        return entropy_target(self.action_spec, action_std)
+
+    def policy_of(self, actor: TensorDictModuleBase) -> TensorDictModuleBase:
+        """What acts in the environment."""
+        return actor
+
+    def make_loss(self, critic: TensorDictModuleBase, **options: Any) -> LeanSACLoss:
+        return LeanSACLoss(self.actor, critic, **options)
+
+    def groups(self, lr: float) -> list[tuple[list[Tensor], float]]:
+        """Trained parameters with their learning rates."""
+        return [(list(self.sac.parameters()), lr)]
+
+    # What a stage defines ----------------------------------------------------------------------
+
+    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
+        kept = batch.select(*self.kept, ("next", "observation"))
+        kept["next"].update(batch["next"].select("done", "terminated"))
+        kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
+        return kept
+
+    def losses(self, batch: TensorDictBase) -> Losses:
+        out = self.sac(self.scaled(batch))
+        return out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"], out
+
+    def scaled(self, batch: TensorDictBase) -> TensorDictBase:
+        """The batch with its rewards in the units of what was seen up to now."""
+        if self.return_scale is None:
+            return batch
+        reward = self.return_scale(batch["next", self.reward])
+        return batch.copy().set(("next", self.reward), reward)
+
+    def acting(self) -> dict[str, Any]:
+        """The parts that a trained policy consists of."""
+        return {"actor": self.actor}
+
+    def parts(self) -> dict[str, Any]:
+        parts = {"sac": self.sac, "optimizer": self.optimizer, **self.acting()}
+        return parts if self.return_scale is None else parts | {"return_scale": self.return_scale}
+
+    # What rewards are scaled by ----------------------------------------------------------------
+
+    def restart_collection(self) -> None:
+        if self.return_scale is not None:
+            self.return_scale.forget()
+        super().restart_collection()
+
+    def seen(self, batch: TensorDictBase) -> TensorDictBase:
+        if self.return_scale is not None:
+            reward = self.reward_scale * batch["next", "reward"]
+            self.return_scale.update(reward.squeeze(-1), batch["next", "done"].squeeze(-1))
+        return batch
+
+
+def support(bins: int, bound: float | None) -> Tensor | None:
+    """Where categorical critics put the return; ``None`` for critics of one output.
+
+    Examples:
+        >>> support(3, 5.0)
+        tensor([-5.,  0.,  5.])
+    """
+    if bins == 1:
+        return None
+    if bound is None:
+        raise ValueError(
+            f"critic.bins is {bins} but sac.return_bound is null; categorical critics need a bound "
+            "on returns, such as sac.return_bound=5."
+        )
+    return torch.linspace(-bound, bound, bins)
