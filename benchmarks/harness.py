@@ -23,9 +23,9 @@ CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
 
 def recipe(*overrides: str) -> DictConfig:
-    """The configuration of ``recipes/etl_sac.py`` with these overrides."""
+    """The configuration of ``recipes/etl_sac.py`` with these overrides, as plain SAC does it."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
+        return compose("config", overrides=["learner=plain", *overrides])
 
 
 def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:

@@ -14,6 +14,7 @@ CONF = ROOT / "recipes" / "conf"
 TINY = (
     "env=overactuated",
     "experiment=smoke",
+    "learner=plain",
     "num_synergies=2",
     "collector.num_envs=4",
     "collector.frames_per_batch=32",

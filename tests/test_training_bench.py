@@ -17,6 +17,7 @@ from hydra.errors import HydraException
 
 from tests.configs import CONF, ROOT, TINY
 from torchrl_etl.training import Bench, Run
+from torchrl_etl.training.bench import COLUMNS
 
 SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=", "threads="))]
 SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]
@@ -91,6 +92,21 @@ def test_a_finished_run_is_left_alone(tmp_path):
     for _ in bench:
         pass
     assert bench.status(run) == "finished" and run.starts == 0
+
+
+def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
+    run = small_run(tmp_path, "raise SystemExit('it must not start')")
+    (tmp_path / "out").mkdir()
+    row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "goal": "", "method": "method"}
+    other = row | {"seed": "7", "status": "unfinished"}
+    lines = [COLUMNS, (row | {"status": "finished"}).values(), other.values()]
+    text = "".join(",".join(line) + "\n" for line in lines)
+    (tmp_path / "out" / "results.csv").write_text(text)
+    bench = Bench([run], tmp_path / "out", jobs=1)
+    for _ in bench:
+        pass
+    assert run.starts == 0
+    assert (tmp_path / "out" / "results.csv").read_text() == text
 
 
 def test_runs_end_with_the_queue(tmp_path):

@@ -7,12 +7,13 @@ import gc
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
 from tests.configs import tiny
 from torchrl_etl.envs import AnalyticOveractuated
-from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.training import Experiment
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.training import Experiment, fit_gmvae
 
 
 def explore_stage(*overrides):
@@ -60,6 +61,41 @@ def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
     assert changed(stage.policy, before)
     assert stage.policy.out_keys[-1] == "action" and stage.action_spec.shape == (16,)
     stage.close()
+
+
+def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_updates(tmp_path):
+    settings = ("learn.reuse_exploration=true", "learn.residual=0.5", "learn.reward_scale=3")
+    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings))
+    experiment.run()
+    stage, decoder = experiment.learn_stage(experiment._decoder()[0]), experiment._decoder()[0]
+    stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
+    rows = stage.buffer.storage[:]
+    assert len(rows) == 600 + 608
+    own = (608 - 96) * 0.25  # none for the batches up to 100 frames
+    assert stage.progress.updates + stage.progress.owed == own + 600 * 0.25
+    first = rows[:600]
+    explored = experiment.explore_stage()
+    explored.checkpoint().load(
+        max((tmp_path / "run" / "checkpoints" / "explore").glob("checkpoint-*"))
+    )
+    kept = explored.newest(600)
+    torch.testing.assert_close(first["action"], kept["action"])
+    # explore.reward_scale is 0.1
+    torch.testing.assert_close(first["next", "reward"], 30 * kept["next", "reward"])
+    assert (first["synergy"][:, decoder.num_synergies :] == 0).all()
+    assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
+
+
+def test_coefficients_of_decoded_actions_are_found_again():
+    torch.manual_seed(0)
+    coefficients = 2 * torch.rand(512, 2) - 1
+    actions = torch.tanh(coefficients @ torch.randn(2, 16))
+    gmvae = fit_gmvae(GMVAE(16, 2, num_components=1), actions, updates=1500)
+    decoder = SynergyDecoder.from_gmvae(gmvae, actions)
+    found = decoder.encode(gmvae, actions)
+    again = decoder(TensorDict({"synergy": found}, [512]))["action"]
+    assert found.abs().max() <= 1
+    assert (again - actions).square().mean() < 0.1 * actions.var(0).mean()
 
 
 def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():

@@ -140,6 +140,15 @@ class SynergyDecoder(TensorDictModule):
             scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
         return decoder
 
+    @torch.no_grad()
+    def encode(self, gmvae: GMVAE, action: Tensor) -> Tensor:
+        """Coefficients [*, d] of actions [*, n], by the GMVAE that the decoder is from.
+
+        They are clamped to the box that a policy acts in.
+        """
+        scaled = self.module
+        return ((gmvae.infer(action) - scaled.center) / scaled.scale).clamp(-1, 1)
+
     @property
     def config(self) -> dict[str, Any]:
         """JSON-able arguments: ``SynergyDecoder(**config)`` plus a state dict rebuilds it."""

@@ -29,6 +29,7 @@ COLUMNS = (
     *("task", "goal", "method", "seed", "frames", "return", "solved", "solved_time"),
     *("episodes", "wall_seconds", "commit", "versions", "machine", "status"),
 )
+KEY = ("task", "goal", "method", "seed")
 RESULTS = "results.csv"
 
 
@@ -54,6 +55,11 @@ class Run:
     @property
     def name(self) -> str:
         return self.path.name
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What tells its rows in the table from those of others."""
+        return _key(vars(self))
 
     @property
     def is_finished(self) -> bool:
@@ -114,9 +120,9 @@ class Run:
 class Bench:
     """Runs a queue with several processes at a time and keeps one table of all evaluations.
 
-    A run that is finished is left alone, one that was begun goes on from its last checkpoint, one
-    that fails is tried again ``attempts`` times in all. However the queue itself ends, its runs
-    end with it or before.
+    A run that is finished is left alone, be it that only its rows in the table are left; one that
+    was begun goes on from its last checkpoint; one that fails is tried again, ``attempts`` times
+    in all. However the queue itself ends, its runs end with it or before.
 
     Args:
         runs (sequence of Run): what to run, in this order.
@@ -140,6 +146,9 @@ class Bench:
             raise RuntimeError(
                 f"Another queue works in {self.folder}; wait for it, or give another folder."
             ) from None
+        # Rows of earlier queues, perhaps of other machines: tables travel, run folders do not.
+        self._earlier = self._read()
+        self._done = {_key(row) for row in self._earlier if row["status"] == "finished"}
 
     def __iter__(self) -> Iterator[Sequence[Run]]:
         """Work through the queue; yields about once a second, for a display."""
@@ -166,7 +175,7 @@ class Bench:
         """waiting, running, finished, failed, or, of one not in this queue's hands, unfinished."""
         if run.process is not None and run.process.poll() is None:
             return "running"
-        if run.is_finished:
+        if run.is_finished or run.key in self._done:
             return "finished"
         return "failed" if run.starts >= self.attempts else "waiting"
 
@@ -184,24 +193,26 @@ class Bench:
         self._lock.release()
 
     def write(self) -> None:
-        """One row per evaluation of every run of the queue, and of others in the folder."""
+        """One row per evaluation of every run of the queue, and what the table held of others."""
         rows = [row for run in self.runs for row in run.rows(self.status(run))]
-        mine = {(row["task"], row["goal"], row["method"], str(row["seed"])) for row in rows}
+        mine = {_key(row) for row in rows}
         text = io.StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(self._rows_of_others(mine))
+        writer.writerows(row for row in self._earlier if _key(row) not in mine)
         writer.writerows(rows)
         write_atomically(self.folder / RESULTS, text.getvalue())
 
-    def _rows_of_others(self, mine: set[tuple[Any, ...]]) -> list[dict[str, str]]:
+    def _read(self) -> list[dict[str, str]]:
         path = self.folder / RESULTS
         if not path.is_file():
             return []
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        keys = ("task", "goal", "method", "seed")
-        return [row for row in rows if tuple(row[key] or None for key in keys) not in mine]
+            return list(csv.DictReader(file))
+
+
+def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple("" if row[name] is None else str(row[name]) for name in KEY)
 
 
 def _end_with_parent() -> None:

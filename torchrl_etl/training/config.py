@@ -65,6 +65,7 @@ _RULES: tuple[_Rule, ...] = (
             "progress",
             "pictures",
             "collector.ahead",
+            "learn.reuse_exploration",
             "explore.bonus.normalize",
             "explore.metric.delay_encoder",
             "actor.layer_norm",
@@ -229,7 +230,8 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 # What the shapes of networks, or the meaning of their weights, depend on.
 _FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir")
-_FIXED += ("learn.residual", "experiment", "faithful", "collector")  # collector.kind may change
+_FIXED += ("learn.residual", "learner", "experiment", "faithful")
+_FIXED += ("collector",)  # the group; collector.kind may change
 _FIXED_SECTIONS = (
     "method",
     "actor",

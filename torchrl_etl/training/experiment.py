@@ -9,8 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
@@ -19,7 +21,7 @@ from torchrl_etl.analysis import learning_curves
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import actuator_names, episode_length, make_env, resolve_task
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.atomic_files import surviving_folder
+from torchrl_etl.modules.atomic_files import surviving_folder, write_atomically
 from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import validate
@@ -135,6 +137,10 @@ class Experiment:
             self.say(f"Warning: {warning}")
         if self.config.pictures:
             self._draw_synergies(stage, decoder, stop)
+        if self._reuses:
+            rows = stage.explored(decoder).flatten_keys(".").cpu()
+            tensors = {key: value.contiguous() for key, value in rows.items()}
+            write_atomically(self.folder.explored, safetensors.torch.save(tensors))
         save_bundle(
             decoder,
             self.folder.synergies,
@@ -167,12 +173,13 @@ class Experiment:
             return self.method.stage()
         learn = self.config.learn
         tuning = {key: learn[key] for key in ("fine_tuning", "decoder_lr", "anchor")}
-        return LearnStage(**self.learner_options(), decoder=decoder, **tuning)
+        given = self.config.explore.frames if self._reuses else 0
+        return LearnStage(**self.learner_options(), decoder=decoder, given=given, **tuning)
 
     def learner_options(self, **env_options: bool) -> dict[str, Any]:
         """Arguments that every stage takes that learns the task, as configured."""
         options = self._options("learn")
-        for of_a_decoder in ("fine_tuning", "decoder_lr", "anchor"):
+        for of_a_decoder in ("fine_tuning", "decoder_lr", "anchor", "reuse_exploration"):
             del options[of_a_decoder]
         return {
             "make_env": self._env_maker(**env_options),
@@ -235,6 +242,10 @@ class Experiment:
         self, decoder: SynergyDecoder | None, charged: int, stop: StopOnSignal
     ) -> dict[str, Any]:
         stage = self.learn_stage(decoder)
+        if self._reuses and decoder is not None:  # a checkpoint, if there is one, replaces it
+            tensors = safetensors.torch.load(self.folder.explored.read_bytes())
+            rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
+            stage.take(rows.to(self.device))
         evaluator = self.evaluator(stage)
         last = run_stage(
             stage,
@@ -319,6 +330,14 @@ class Experiment:
             if self._shows_activations:  # otherwise the environment is as that of ``spec``
                 self.make_env(activations=True).close()
         self.learn_stage(self.blank_decoder())
+
+    @property
+    def _reuses(self) -> bool:
+        return (
+            self.config.learn.reuse_exploration
+            and self.config.synergies is None
+            and self.config.stage == "all"
+        )
 
     @property
     def _shows_activations(self) -> bool:

@@ -191,6 +191,16 @@ class ExploreStage(Stage):
             gradient_step(self.optimizer, loss)
         return SynergyDecoder.from_gmvae(self.gmvae, self.actions())
 
+    def explored(self, decoder: SynergyDecoder) -> TensorDictBase:
+        """All kept transitions as stage 2 has them: the task's reward, and each executed action
+        with the coefficients that come nearest to it.
+        """
+        rows = self.newest(self.budget)
+        kept = rows.select("observation", "action", ("next", "observation"))
+        kept["next"].update(rows["next"].select("done", "terminated"))
+        kept["next", "reward"] = rows["next", "reward"] / self.reward_scale
+        return kept.set("synergy", decoder.encode(self.gmvae, rows["action"]))
+
     def actions(self, count: int = 20_000) -> Tensor:
         """Up to ``count`` of the latest actions shown to the GMVAE, [N, n]."""
         return self.newest(count)["shown_action"]

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
@@ -87,6 +87,17 @@ class LearnStage(SACStage):
         if self.anchor:
             loss = loss + self.anchor * reconstruction
         return loss, scalars.set("loss_decoder", reconstruction)
+
+    def take(self, rows: TensorDictBase) -> None:
+        """Learn from transitions of another policy too, as often as from frames of one's own.
+
+        The critics value executed actions, so it does not matter which policy chose them. Their
+        ``synergy`` has d entries; where there is a residual, theirs is zero.
+        """
+        missing = self.decoder.synergy_dim - rows["synergy"].shape[-1]
+        rows = rows.copy().set("synergy", nn.functional.pad(rows["synergy"], (0, missing)))
+        self.buffer.extend(self.transitions(rows))
+        self.progress.owed += len(rows) * self.updates_per_frame
 
     def acting(self) -> dict[str, Any]:
         return {**super().acting(), "decoder": self.decoder}

@@ -97,6 +97,11 @@ class RunFolder:
         return self.path / "synergies"
 
     @property
+    def explored(self) -> Path:
+        """Transitions of stage 1 for stage 2."""
+        return self.path / "explored.safetensors"
+
+    @property
     def pictures(self) -> Path:
         (self.path / "pictures").mkdir(exist_ok=True)
         return self.path / "pictures"

@@ -80,6 +80,7 @@ class Stage(ABC):
         updates_per_frame (float): updates per collected frame.
         learning_starts (int): frames before the first update.
         reward_scale (float): factor on the task's reward as the buffer keeps it.
+        given (int): transitions to make room for beside the budget. Default: 0.
         compile (bool): compile updates; on CUDA they also become one CUDA graph.
             Default: ``False``.
     """
@@ -104,6 +105,7 @@ class Stage(ABC):
         updates_per_frame: float,
         learning_starts: int,
         reward_scale: float,
+        given: int = 0,
         compile: bool = False,
     ) -> None:
         self.policy, self.seed, self.device = policy, seed, device
@@ -116,12 +118,13 @@ class Stage(ABC):
         self.progress = Progress()
         self.buffer = TensorDictReplayBuffer(
             storage=make_storage(
-                min(buffer_size, frames + collector["frames_per_batch"]),
+                min(buffer_size, given + frames + collector["frames_per_batch"]),
                 device,
                 scratch / self.name if buffer_storage == "memmap" else None,
             ),
             batch_size=batch_size,
         )
+        self._most_updates = math.ceil(2 * updates_per_frame * collector["frames_per_batch"])
         self.batches: Batches | None = None
         self._gradients = compiled(self.gradients) if compile else self.gradients
         graphed = compile and device.type == "cuda"
@@ -181,7 +184,8 @@ class Stage(ABC):
 
     def learn(self) -> TensorDictBase | None:
         """The updates that the collected frames have earned; returns their mean scalars."""
-        due = int(self.progress.owed)
+        # What more than one batch is owed, for frames that were given, is made up for in parts.
+        due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
         self.progress.updates += due
         logs = [self.update() for _ in range(due)]
