@@ -1,0 +1,298 @@
+"""The report of a bench: its tables and pictures."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_etl.analysis.bench_pictures import looks, overall_picture, task_picture
+from torchrl_etl.analysis.bench_results import BenchResults
+from torchrl_etl.analysis.bench_statistics import (
+    Comparison,
+    MethodResult,
+    OverallResult,
+    Scale,
+    compare,
+    normalize,
+    overall,
+)
+from torchrl_etl.analysis.published import caveats, environment_id, published_curves
+from torchrl_etl.analysis.statistics import Interval
+from torchrl_etl.modules.atomic_files import write_atomically
+
+__all__ = ["write_report"]
+
+HOW_TO_READ = """\
+How to read the tables. A run counts with its last evaluation at or before the budget; nothing is \
+interpolated. `mean` and the range are over seeds. `IQM` is the interquartile mean (of three seeds \
+or fewer: the mean) with the percentile bootstrap's 95 % interval, seeds resampled within each \
+task (rliable); of two seeds it is their range. `P(> {control})` is the probability that a run \
+beats a run of {control}, a tie counting one half. One seed says nothing about spread and gets no \
+interval. `solved` is the share of episodes, `solved time` the share of steps."""
+
+
+def write_report(
+    bench: BenchResults,
+    folder: Path,
+    arguments: Sequence[str],
+    *,
+    control: str = "sac",
+    frames: int | None = None,
+    repetitions: int = 2000,
+) -> tuple[int, int]:
+    """Write report.md and its pictures.
+
+    Args:
+        bench (BenchResults): the evaluations.
+        folder (path): where to; made if it is not there.
+        arguments (sequence of str): settings that led to this report, to be named in it.
+
+    Keyword Args:
+        control (str): the method against which improvement is measured.
+        frames (int, optional): compare at so many environment frames; ``None``: the most that a
+            task's runs share.
+        repetitions (int): resamples of each bootstrap interval.
+
+    Returns:
+        tuple of int: tasks and methods in it.
+
+    Raises:
+        ValueError: for a control that was not run, or frames that no run reached.
+    """
+    methods = _methods(bench, control)
+    folder.mkdir(parents=True, exist_ok=True)
+    styles = looks(methods)
+    comparisons = []
+    for setting in bench.settings:
+        runs = [run for run in bench.finished if run.setting == setting]
+        if runs:
+            comparison = compare(runs, methods, control, frames=frames, repetitions=repetitions)
+            comparisons.append(comparison)
+            picture = folder / _picture(setting)
+            task_picture(runs, styles, picture, budget=comparison.budget, repetitions=repetitions)
+    scales = [normalize(comparison, control) for comparison in comparisons]
+    results = overall(comparisons, scales, methods, control, repetitions=repetitions)
+    if results:
+        overall_picture(results, styles, folder / "overall.png")
+    parts = [
+        "# Bench report",
+        *_header(bench, arguments, control),
+        "## Over all tasks",
+        *_overall(results, comparisons, scales, control),
+    ]
+    for setting in bench.settings:
+        found = next((c for c in comparisons if c.setting == setting), None)
+        parts += ["## {} ({} goal)".format(*setting)]
+        parts += _task(found, methods, control) if found else ["No run finished."]
+    parts += ["## Runs that did not end", *_unfinished(bench)]
+    parts += ["## What produced the numbers", *_origins(bench)]
+    write_atomically(folder / "report.md", "\n\n".join(parts) + "\n")
+    return len(comparisons), len(methods)
+
+
+def _methods(bench: BenchResults, control: str) -> list[str]:
+    """The methods that finished a run, the control first."""
+    if not bench.finished:
+        raise ValueError(f"None of the {len(bench.runs)} runs finished: nothing to report.")
+    methods = sorted({run.method for run in bench.finished})
+    if control not in methods:
+        near = difflib.get_close_matches(control, methods, n=3)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(methods)}."
+        raise ValueError(f"control={control} has no finished run; {hint}")
+    return [control, *(method for method in methods if method != control)]
+
+
+def _header(bench: BenchResults, arguments: Sequence[str], control: str) -> list[str]:
+    command = shlex.join(["python", "recipes/report.py", *arguments])
+    counts = (
+        f"{bench.row_count} evaluations of {len(bench.runs)} runs, of which {len(bench.finished)} "
+        f"finished and {len(bench.unfinished)} did not. Only finished runs are in tables and "
+        "pictures."
+    )
+    if bench.replaced:
+        counts += (
+            f" {bench.replaced} evaluations belong to runs that were repeated later: the newest "
+            "row of a run counts."
+        )
+    never = sorted({run.method for run in bench.unfinished} - {r.method for r in bench.finished})
+    if never:
+        counts += f" No run finished of {', '.join(never)}."
+    return [f"`{command}`", counts, HOW_TO_READ.format(control=control)]
+
+
+def _overall(
+    results: Sequence[OverallResult],
+    comparisons: Sequence[Comparison],
+    scales: Sequence[Scale | str],
+    control: str,
+) -> list[str]:
+    parts = [
+        "Returns are normalized per task, (x − zero)/(one − zero): zero is the mean return of the "
+        f"untrained policies, one the best published mean at the same frames, or {control}'s own "
+        "mean where nothing is published. Runs of all tasks are pooled, so a task with more seeds "
+        f"weighs more. A method is averaged over the tasks that it has; beside it stands {control} "
+        "on the same tasks.",
+    ]
+    if results:
+        rows = [
+            (
+                result.method,
+                str(len(result.settings)),
+                *_interval(result.iqm),
+                "-" if result.control_iqm is None else f"{result.control_iqm:.3f}",
+                *(("-", "-") if result.improvement is None else _interval(result.improvement)),
+            )
+            for result in results
+        ]
+        header = ("method", "tasks", "IQM", "95 %", f"{control} there", f"P(> {control})", "95 %")
+        parts += [_table(header, rows), "![Methods over all tasks](overall.png)"]
+        for result in results:
+            if result.missing:
+                parts.append(f"{result.method} lacks {_names(result.missing)}.")
+    else:
+        parts.append("No task has a scale; the reasons are below.")
+    rows = []
+    for comparison, scale in zip(comparisons, scales, strict=True):
+        name, budget = "{} ({})".format(*comparison.setting), f"{comparison.budget:,}"
+        if isinstance(scale, Scale):
+            zero, one = _plain(scale.zero), _plain(scale.one)
+            rows.append((name, budget, zero, one, scale.source))
+        else:
+            rows.append((name, budget, "-", "-", f"left out: {scale}"))
+    parts.append(_table(("task", "frames", "zero", "one", "whose return is one"), rows))
+    late = [c for c in comparisons if c.untrained_frames > 0]
+    if late:
+        parts.append(
+            "Without an evaluation at frame 0, so that zero is the mean of the first evaluations "
+            "and normalized returns are too low: "
+            + ", ".join("{} ({})".format(*c.setting) + f" at {c.untrained_frames:,}" for c in late)
+            + "."
+        )
+    return parts
+
+
+def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[str]:
+    parts = [f"At {comparison.budget:,} environment frames, exploration included."]
+    solved = any(np.isfinite(result.solved).any() for result in comparison.results)
+    header = ["method", "seeds", "mean", "min to max", "IQM", "95 %", f"P(> {control})"]
+    header += ["solved", "solved time"] * solved + ["wall time [h]"]
+    if comparison.results:
+        parts.append(_table(header, [_method_row(result, solved) for result in comparison.results]))
+    notes = []
+    absent = [name for name in methods if comparison.result(name) is None]
+    if absent:
+        notes.append(f"Without a finished run that reached the budget: {', '.join(absent)}.")
+    if len({len(result.seeds) for result in comparison.results}) > 1:
+        notes.append("The methods have unequal numbers of seeds.")
+    if comparison.short:
+        notes.append(f"Left out, ended before the budget: {_runs(comparison.short)}.")
+    if comparison.stale:
+        notes.append(
+            "Counted with an evaluation more than 5 % before the budget: "
+            f"{_runs(comparison.stale)}."
+        )
+    env_id = environment_id(*comparison.setting)
+    if published_curves(env_id) or published_curves(env_id, "success"):
+        notes.append(caveats(env_id))
+    if notes:
+        parts.append("\n".join(f"- {note}" for note in notes))
+    return [*parts, f"![Learning curves]({_picture(comparison.setting)})"]
+
+
+def _method_row(result: MethodResult, solved: bool) -> tuple[str, ...]:
+    returns = result.returns
+    one = len(returns) == 1
+    return (
+        result.method,
+        str(len(result.seeds)),
+        _plain(returns.mean()),
+        "-" if one else f"{_plain(returns.min())} to {_plain(returns.max())}",
+        *_interval(result.iqm, _plain),
+        "-" if result.improvement is None else f"{result.improvement:.2f}",
+        *((_percent(result.solved), _percent(result.solved_time)) if solved else ()),
+        _mean(result.wall_seconds / 3600, "{:.2f}"),
+    )
+
+
+def _unfinished(bench: BenchResults) -> list[str]:
+    if not bench.unfinished:
+        return ["None."]
+    return [
+        "\n".join(
+            f"- {run}: {run.status}, last evaluated at {run.last_frames:,} frames"
+            for run in bench.unfinished
+        )
+    ]
+
+
+def _origins(bench: BenchResults) -> list[str]:
+    """Commits, machines and versions of the finished runs, with how many runs each has."""
+    commits, machines, versions = Counter(), Counter(), Counter()
+    mixed = []
+    for run in bench.finished:
+        own = {row.commit or "unknown" for row in run.rows}
+        commits.update(own)
+        if len(own) > 1:
+            mixed.append(run)
+        machines.update({row.machine or "unknown" for row in run.rows})
+        versions.update({pair for row in run.rows for pair in row.versions.items()})
+    parts = [
+        _table(("commit", "runs"), [(name, str(n)) for name, n in sorted(commits.items())]),
+        _table(("machine", "runs"), [(name, str(n)) for name, n in sorted(machines.items())]),
+    ]
+    if len(machines) > 1:
+        parts.append("Wall times of different machines do not compare.")
+    if mixed:
+        parts.append(f"Of more than one commit: {_runs(mixed)}.")
+    if versions:
+        rows = [(*pair, str(count)) for pair, count in sorted(versions.items())]
+        parts.append(_table(("package", "version", "runs"), rows))
+    return parts
+
+
+def _interval(interval: Interval, number=lambda value: f"{value:.3f}") -> tuple[str, str]:
+    point, low, high = interval
+    if math.isnan(low):
+        return number(point), "one seed: no interval"
+    return number(point), f"{number(low)} to {number(high)}"
+
+
+def _plain(value: float) -> str:
+    """A return with as many digits as it can bear: 2,212 or 68.3 or 0.123."""
+    digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 10 else 3
+    return f"{value:,.{digits}f}"
+
+
+def _percent(shares: np.ndarray) -> str:
+    return _mean(100 * shares, "{:.0f} %")
+
+
+def _mean(values: np.ndarray, form: str) -> str:
+    known = values[np.isfinite(values)]
+    return form.format(known.mean()) if known.size else "-"
+
+
+def _names(settings: Sequence[tuple[str, str]]) -> str:
+    return ", ".join("{} ({})".format(*setting) for setting in settings)
+
+
+def _runs(runs: Sequence[object]) -> str:
+    return "; ".join(map(str, runs))
+
+
+def _picture(setting: tuple[str, str]) -> str:
+    return re.sub(r"[^\w.-]+", "_", "-".join(setting)) + ".png"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    # A bar inside a cell, as in a status or a machine's name, would end the cell.
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    lines = [header, ["---"] * len(header), *cells]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
