@@ -71,8 +71,12 @@ class DEPStage(SACStage):
         super().__init__(*args, **sac_stage)
 
     def exploring(self, noise: str) -> TensorDictModuleBase:
-        controller = DEPExploration(self.action_spec, **self._dep)
-        return TensorDictSequential(super().exploring(noise), controller)
+        self.controller = DEPExploration(self.action_spec, **self._dep)
+        return TensorDictSequential(super().exploring(noise), self.controller)
+
+    def restart_collection(self) -> None:
+        self.controller.frames = self.frames  # a resumed run goes on where it was
+        super().restart_collection()
 
 
 class DynSynStage(SACStage):
