@@ -16,7 +16,7 @@ from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.methods import PlayStage
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
-RIVALS = [name for name in METHODS if not name.startswith("etl")]
+RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
 ELBOW = "env=myoElbowPose1D6MFixed-v0"
 BRIEFLY = {
     "dep": ["method.options.dep_frames=64", "method.options.tau=4"],

@@ -268,10 +268,13 @@ def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
 
 
 @pytest.mark.slow
-def test_a_compiled_update_is_the_same_update():
-    stages = [learn_stage(None, f"compile={compile}") for compile in ("false", "true")]
+@pytest.mark.parametrize("learner", ["plain", "residual"])
+def test_a_compiled_update_is_the_same_update(learner):
+    settings = (f"learner={learner}", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
+    stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])
     batch = stages[0].buffer.sample()
+    stages[1].return_scale = stages[0].return_scale
     stages[1].sac.load_state_dict(stages[0].sac.state_dict())
     outs = []
     for stage in stages:

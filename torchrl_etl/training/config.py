@@ -231,7 +231,7 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 # What the shapes of networks, or the meaning of their weights, depend on.
 _FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir")
 _FIXED += ("learn.residual", "learner", "experiment", "faithful")
-_FIXED += ("collector",)  # the group; collector.kind may change
+_FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
 _FIXED_SECTIONS = (
     "method",
     "actor",
