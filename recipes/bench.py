@@ -102,15 +102,15 @@ class Display:
 
     def table(self) -> Table:
         table = Table("run", "status", "frames", "return", "solved", "time left")
+        table.columns[0].overflow = "fold"
         for run in self.bench.runs:
             status, folder = self.bench.status(run), run.folder
             cells = [run.name, status]
             if folder is None:
                 table.add_row(*cells)
                 continue
-            frames = max(
-                folder.series(f"{stage}/updates")[0][-1:] for stage in ("explore", "learn")
-            )
+            stages = ("explore", "play", "learn")
+            frames = max(folder.series(f"{stage}/updates")[0][-1:] for stage in stages)
             done, returns = (frames or [0])[0], folder.series("learn/eval/return")[1]
             solved = folder.series("learn/eval/solved")[1]
             cells += [f"{done:,}", f"{returns[-1]:.1f}" if returns else ""]

@@ -31,6 +31,7 @@ COLUMNS = (
 )
 KEY = ("task", "goal", "method", "seed")
 RESULTS = "results.csv"
+EARLIER_STAGES = ("explore", "play")
 
 
 @dataclass
@@ -104,7 +105,7 @@ class Run:
         own = {"commit": facts.pop("commit"), "machine": facts.pop("machine")}
         own |= {"versions": json.dumps(facts), "status": status}
         own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
-        explored = folder.series("explore/wall_seconds")[1]
+        before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
         own["episodes"] = OmegaConf.load(self.path / "config.yaml").evaluation.episodes
         series = {
             key: dict(zip(*folder.series(f"learn/eval/{key}"), strict=True))
@@ -112,8 +113,8 @@ class Run:
         }
         for frames in sorted(series["return"]):
             row = own | {"frames": frames} | {k: v.get(frames) for k, v in series.items()}
-            if explored and row["wall_seconds"] is not None:
-                row["wall_seconds"] += explored[-1]
+            if row["wall_seconds"] is not None:
+                row["wall_seconds"] += before
             yield row
 
 
