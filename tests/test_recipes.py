@@ -139,6 +139,7 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
 @pytest.mark.parametrize(
     ("recipe", "override", "words"),
     [
+        ("etl_sac.py", "method=latice", "nearest: lattice"),
         ("etl_sac.py", "enf=myoHandPose", "did you mean env"),
         ("etl_sac.py", "learn.frame=3", "learn.frames"),
         ("etl_sac.py", "env=myoHandPos", "myoHandPose"),

@@ -13,6 +13,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_etl.modules.checks import check_choice
+
 __all__ = [
     "check_overrides",
     "draw_without_display",
@@ -39,21 +41,26 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
         sys.exit()
     known = list(_keys(OmegaConf.create(text)))
     defaults = OmegaConf.create(text).get("defaults", [])
+    choices: dict[str, list[str]] = {}
     for group in [name for entry in defaults if isinstance(entry, DictConfig) for name in entry]:
         known.append(group)
+        choices[group] = sorted(path.stem for path in (config.parent / group).glob("*.yaml"))
         for choice in (config.parent / group).glob("*.yaml"):
             prefix = "" if "@package _global_" in choice.read_text("utf-8") else f"{group}."
             known += _keys(OmegaConf.load(choice), prefix)
     for argument in arguments:
-        key, separator, _ = argument.partition("=")
+        key, separator, value = argument.partition("=")
         if argument.startswith(("-", "+", "~")) or key.startswith("hydra"):
             continue
         if not separator:
             sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=3)
+            near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
+        if choices.get(key):
+            with one_sentence(ValueError):
+                check_choice(key, value, choices[key])
 
 
 def quote_paths(arguments: list[str], *keys: str) -> list[str]:
