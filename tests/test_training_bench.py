@@ -16,8 +16,8 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
 from tests.configs import CONF, ROOT, TINY
+from torchrl_etl.analysis.bench_results import COLUMNS
 from torchrl_etl.training import Bench, Run
-from torchrl_etl.training.bench import COLUMNS
 
 SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=", "threads="))]
 SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]

@@ -44,8 +44,9 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
     choices: dict[str, list[str]] = {}
     for group in [name for entry in defaults if isinstance(entry, DictConfig) for name in entry]:
         known.append(group)
-        choices[group] = sorted(path.stem for path in (config.parent / group).glob("*.yaml"))
-        for choice in (config.parent / group).glob("*.yaml"):
+        files = sorted((config.parent / group).glob("*.yaml"))
+        choices[group] = [path.stem for path in files]
+        for choice in files:
             prefix = "" if "@package _global_" in choice.read_text("utf-8") else f"{group}."
             known += _keys(OmegaConf.load(choice), prefix)
     for argument in arguments:

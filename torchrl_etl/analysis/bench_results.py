@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_etl.envs import list_tasks
 
-__all__ = ["COLUMNS", "BenchResults", "BenchRow", "BenchRun", "read_bench"]
+__all__ = ["COLUMNS", "RESULTS", "BenchResults", "BenchRow", "BenchRun", "read_bench"]
 
 COLUMNS = (
     "task",
@@ -34,7 +34,7 @@ COLUMNS = (
     "status",
 )
 
-_RESULTS = "results.csv"
+RESULTS = "results.csv"
 
 
 class BenchRow(NamedTuple):
@@ -162,13 +162,11 @@ def read_bench(folder: str | os.PathLike[str]) -> BenchResults:
             read; or a finished run has an evaluation without a return.
     """
     folder = Path(folder)
-    path = folder / _RESULTS
+    path = folder / RESULTS
     if not folder.is_dir():
         raise FileNotFoundError(f"There is no folder {folder}; pass the one that the bench wrote.")
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{folder} has no {_RESULTS}; pass the folder that the bench wrote."
-        )
+        raise FileNotFoundError(f"{folder} has no {RESULTS}; pass the folder that the bench wrote.")
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]

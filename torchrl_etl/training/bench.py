@@ -14,23 +14,20 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
+from torchrl_etl.analysis.bench_results import COLUMNS, RESULTS
 from torchrl_etl.modules.atomic_files import write_atomically
 from torchrl_etl.training.run_folder import RunFolder
 
-__all__ = ["COLUMNS", "Bench", "Run"]
+__all__ = ["Bench", "Run"]
 
-COLUMNS = (
-    *("task", "goal", "method", "seed", "frames", "return", "solved", "solved_time"),
-    *("episodes", "wall_seconds", "commit", "versions", "machine", "status"),
-)
 KEY = ("task", "goal", "method", "seed")
-RESULTS = "results.csv"
 EARLIER_STAGES = ("explore", "play")
 
 
@@ -73,8 +70,15 @@ class Run:
 
     @property
     def folder(self) -> RunFolder | None:
-        config = self.path / "config.yaml"
-        return RunFolder(self.path, OmegaConf.load(config)) if config.is_file() else None
+        """What it logged, once it has begun."""
+        begun = (self.path / "config.yaml").is_file()
+        # Its series are read every second; its configuration, 30 ms to parse, is not needed.
+        return RunFolder(self.path, OmegaConf.create()) if begun else None
+
+    @cached_property
+    def episodes(self) -> int:
+        """Of each evaluation; there is a configuration to read it from."""
+        return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
     def start(self, environ: Mapping[str, str]) -> None:
         """Begin, or go on where an earlier start was stopped."""
@@ -106,7 +110,7 @@ class Run:
         own |= {"versions": json.dumps(facts), "status": status}
         own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
         before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
-        own["episodes"] = OmegaConf.load(self.path / "config.yaml").evaluation.episodes
+        own["episodes"] = self.episodes
         series = {
             key: dict(zip(*folder.series(f"learn/eval/{key}"), strict=True))
             for key in ("return", "solved", "solved_time", "wall_seconds")

@@ -14,12 +14,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.training.methods import METHODS
 
 __all__ = ["resumed_config", "validate"]
 
 _CHOICES = {
     "collector.kind": COLLECTORS,
-    "method.learner": ("etl", "sac", "lattice", "dep", "dynsyn", "eme", "sar"),
+    "method.learner": ("etl", *METHODS),
     "stage": ("explore", "learn", "all"),
     "explore.fit.actions": ("mean", "sampled", "activation"),
     "explore.representation": ("metric", "metra"),
