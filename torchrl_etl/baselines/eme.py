@@ -23,6 +23,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl_etl import functional
 from torchrl_etl.modules.checks import check_choice, check_positive
 from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.pairs import outputs, partners
 
 __all__ = ["EMELoss", "RewardEnsemble", "diversity_scale"]
 
@@ -299,12 +300,12 @@ class EMELoss(LossModule):
         reward = following.get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten()
-        partner = _partners(reward.numel(), reward.device)
+        partner = partners(reward.numel(), reward.device).squeeze(1)
 
-        embedding = _apply(self.encoder, self.encoder_params, tensordict)
-        predictions = _apply(self.ensemble, self.ensemble_params, tensordict)
+        embedding = outputs(self.encoder, self.encoder_params, tensordict)
+        predictions = outputs(self.ensemble, self.ensemble_params, tensordict)
         with torch.no_grad():
-            next_embedding = _apply(self.encoder, self.target_encoder_params, following)
+            next_embedding = outputs(self.encoder, self.target_encoder_params, following)
             ended = following.get(self.tensor_keys.terminated).reshape(-1, 1)
             next_embedding = next_embedding.masked_fill(ended, 0.0)
             loc, scale = self._gaussian(tensordict, like=embedding)
@@ -361,21 +362,3 @@ class EMELoss(LossModule):
         inputs = inputs.to(parameter.device, parameter.dtype)
         written = self.actor.get_dist_params(inputs)
         return [written.get(key).flatten(0, -2).to(like) for key in self.policy_keys]
-
-
-def _partners(samples: int, device: torch.device) -> Tensor:
-    """Index [samples] of the other transition that each one is compared with."""
-    if samples < 2:
-        raise ValueError("The batch holds one transition; distances need at least two.")
-    # Neighbors on a random circle: a random permutation that maps no sample to itself.
-    order = torch.randperm(samples, device=device)
-    return torch.empty_like(order).scatter_(0, order, order.roll(1))
-
-
-def _apply(
-    network: TensorDictModuleBase, params: TensorDictParams, tensordict: TensorDictBase
-) -> Tensor:
-    """A network's first output [samples, size] with these parameters."""
-    with params.to_module(network, preserve_module_state=False):
-        written = network(tensordict.select(*network.in_keys))
-    return written.get(network.out_keys[0]).flatten(0, -2)

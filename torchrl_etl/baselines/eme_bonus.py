@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
 
 from torchrl_etl import functional
 from torchrl_etl.baselines.eme import diversity_scale
+from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
 __all__ = ["EMEBonus"]
 
 
-class EMEBonus(Transform):
+class EMEBonus(TransitionReward):
     """Rewards steps that are long in EME's metric, more so where the reward is not yet known.
 
     The same class works in three places: on an env, where every step writes the bonus; on a replay
@@ -77,6 +76,8 @@ class EMEBonus(Transform):
         torch.Size([5, 1])
     """
 
+    _cure = "name the right one in in_keys."
+
     def __init__(
         self,
         encoder: TensorDictModuleBase,
@@ -117,66 +118,25 @@ class EMEBonus(Transform):
         """The ensemble given at construction, not a copy."""
         return self._networks[1]
 
+    @property
+    def _observed(self) -> Sequence[NestedKey]:
+        return self.in_keys[:1]  # the other is the action, which every step has
+
     @torch.no_grad()
     def _rewards(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> tuple[Tensor, Tensor]:
         observation_key, action_key = self.in_keys
-        observation = _read(tensordict, observation_key)
-        action = _read(tensordict, action_key)
-        next_observation = _read(next_tensordict, observation_key, "next")
-        reward = _read(next_tensordict, self.reward_key, "next")
+        observation = self._read(tensordict, observation_key)
+        action = self._read(tensordict, action_key)
+        next_observation = self._read(next_tensordict, observation_key, "next")
+        reward = self._read(next_tensordict, self.reward_key, "next")
         # One pass through the encoder for both ends of the transition.
-        ends = _evaluate(self.encoder, torch.stack([observation, next_observation]))
+        ends = evaluate(self.encoder, torch.stack([observation, next_observation]))
         distance = functional.l2_distance(*ends.unbind(0)).unsqueeze(-1)
-        scale = diversity_scale(_evaluate(self.ensemble, observation, action), self.max_scale)
+        scale = diversity_scale(evaluate(self.ensemble, observation, action), self.max_scale)
         bonus = distance.to(reward.device) * scale.to(reward.device)
         return bonus, reward + self.weight * bonus
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict = tensordict.get("next", None)
-        if next_tensordict is None:
-            raise KeyError(
-                "EMEBonus needs whole transitions, but the tensordict has no 'next' entry; call it "
-                "on data from a rollout, a collector or a replay buffer."
-            )
-        rewards = self._rewards(tensordict, next_tensordict)
-        for key, value in zip(self.out_keys, rewards, strict=True):
-            tensordict.set(unravel_key(("next", key)), value)
-        return tensordict
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        rewards = self._rewards(tensordict, next_tensordict)
-        for key, value in zip(self.out_keys, rewards, strict=True):
-            next_tensordict.set(key, value)
-        return next_tensordict
-
-    def transform_state_spec(self, state_spec: Composite | None) -> Composite:
-        # A parallel env hands its workers the action and what the state spec names, no more:
-        # without this entry a worker would take the root of its own last step for the caller's.
-        if state_spec is None:
-            state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
-        if self.in_keys[0] not in state_spec.keys(True, True):
-            state_spec[self.in_keys[0]] = self._observation_leaf().clone()
-        return state_spec
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        leaf = self._observation_leaf()
-        for key in self.out_keys:
-            reward_spec[key] = Unbounded(
-                shape=(*leaf.shape[:-1], 1), dtype=leaf.dtype, device=leaf.device
-            )
-        return reward_spec
-
-    def _observation_leaf(self) -> Unbounded:
-        observation_spec = self.parent.full_observation_spec
-        if self.in_keys[0] not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"EMEBonus reads {self.in_keys[0]!r}, but the env's observations are "
-                f"{sorted(map(str, observation_spec.keys(True, True)))}; name the right one in "
-                "in_keys."
-            )
-        return observation_spec[self.in_keys[0]]
 
 
 def _check_keys(name: str, module: TensorDictModuleBase, reads: Sequence[str]) -> None:
@@ -190,21 +150,3 @@ def _check_keys(name: str, module: TensorDictModuleBase, reads: Sequence[str]) -
             f"The {name} reads {list(module.in_keys)} and writes {list(module.out_keys)}; it must "
             f"read {' and '.join(reads)}, and write one key."
         )
-
-
-def _read(tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
-    value = tensordict.get(key, None)
-    if value is None:
-        raise KeyError(
-            f"EMEBonus reads {unravel_key((*prefix, key))!r}, which the data lacks; beside it are "
-            f"{sorted(map(str, tensordict.keys(True, True)))}."
-        )
-    return value
-
-
-def _evaluate(network: TensorDictModuleBase, *inputs: Tensor) -> Tensor:
-    """The network's output for bare tensors, computed on the network's own device."""
-    device = next(iter(network.parameters()), inputs[0]).device
-    entries = dict(zip(network.in_keys, inputs, strict=True))
-    written = network(TensorDict(entries, inputs[0].shape[:-1], device=device))
-    return written.get(network.out_keys[0])

@@ -15,6 +15,7 @@ from torchrl.objectives.common import LossModule
 from torchrl_etl import functional
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.pairs import outputs, partners
 
 __all__ = ["BehavioralMetricLoss"]
 
@@ -218,11 +219,11 @@ class BehavioralMetricLoss(LossModule):
         reward = following.get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale
-        partner = self._partners(reward.numel(), reward.device)
+        partner = partners(reward.numel(), reward.device, self.pairs)
 
-        embedding = self._embed(tensordict, self.encoder_params)
+        embedding = outputs(self.encoder, self.encoder_params, tensordict)
         with torch.no_grad():
-            next_embedding = self._embed(following, self.target_encoder_params)
+            next_embedding = outputs(self.encoder, self.target_encoder_params, following)
             ended = following.get(self.tensor_keys.terminated).reshape(-1, 1)
             next_embedding = next_embedding.masked_fill(ended, 0.0)
 
@@ -265,27 +266,10 @@ class BehavioralMetricLoss(LossModule):
             }
         )
 
-    def _partners(self, samples: int, device: torch.device) -> Tensor:
-        """Indices [samples, pairs per sample] of the others that each sample is compared with."""
-        if samples < 2:
-            raise ValueError("The batch holds one transition; distances need at least two.")
-        if self.pairs == "all":
-            index = torch.arange(samples, device=device)
-            return (index.unsqueeze(1) + index[1:]) % samples
-        # Neighbors on a random circle: a random permutation that maps no sample to itself.
-        order = torch.randperm(samples, device=device)
-        return torch.empty_like(order).scatter_(0, order, order.roll(1)).unsqueeze(1)
-
-    def _embed(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
-        """Embeddings [samples, k]."""
-        with params.to_module(self.encoder, preserve_module_state=False):
-            written = self.encoder(tensordict.select(*self.encoder.in_keys))
-        return written.get(self.encoder.out_keys[0]).flatten(0, -2)
-
     def _predict(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation [samples, k] of what follows, in the targets' space."""
         with torch.no_grad():
-            embedding = self._embed(tensordict, self.target_encoder_params)
+            embedding = outputs(self.encoder, self.target_encoder_params, tensordict)
         inputs = TensorDict({self.dynamics.in_keys[0]: embedding}, embedding.shape[:-1])
         with self.dynamics_params.to_module(self.dynamics, preserve_module_state=False):
             written = self.dynamics(inputs)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
 
 from torchrl_etl.functional import direction_bonus
+from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
 __all__ = ["IntrinsicReward"]
 
@@ -49,7 +48,7 @@ class _RunningDeviation(nn.Module):
         return torch.maximum(self.variance, floor).sqrt().clamp_min(self._EPSILON)
 
 
-class IntrinsicReward(Transform):
+class IntrinsicReward(TransitionReward):
     """Rewards movement of the state embedding along the direction of the episode.
 
     The same class works in three places:
@@ -127,6 +126,11 @@ class IntrinsicReward(Transform):
         torch.Size([5, 1])
     """
 
+    _cure = (
+        "put the transform that writes it (DirectionPrimer for the direction) before "
+        "IntrinsicReward."
+    )
+
     def __init__(
         self,
         encoder: TensorDictModuleBase,
@@ -170,19 +174,16 @@ class IntrinsicReward(Transform):
         return self._encoder
 
     @torch.no_grad()
-    def _reward(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor:
+    def _rewards(
+        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+    ) -> tuple[Tensor]:
         observation_key, direction_key = self.in_keys
         observation = self._read(tensordict, observation_key)
         direction = self._read(tensordict, direction_key)
         next_observation = self._read(next_tensordict, observation_key, "next")
-        parameter = next(iter(self.encoder.parameters()), direction)
         # One pass through the encoder for both ends of the transition.
-        ends = TensorDict(
-            {self.encoder.in_keys[0]: torch.stack([observation, next_observation])},
-            [2, *tensordict.batch_size],
-            device=parameter.device,
-        )
-        embedding, next_embedding = self.encoder(ends).get(self.encoder.out_keys[0]).unbind(0)
+        ends = evaluate(self.encoder, torch.stack([observation, next_observation]))
+        embedding, next_embedding = ends.unbind(0)
         if embedding.shape[-1] != direction.shape[-1]:
             raise ValueError(
                 f"The encoder's embedding has {embedding.shape[-1]} dimensions but "
@@ -200,54 +201,4 @@ class IntrinsicReward(Transform):
         if self.extrinsic_weight:
             reward = self._read(next_tensordict, self.reward_key, "next")
             bonus = bonus + self.extrinsic_weight * reward
-        return bonus
-
-    @staticmethod
-    def _read(tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(
-                f"IntrinsicReward reads {unravel_key((*prefix, key))!r}, which the data lacks; "
-                f"beside it are {sorted(map(str, tensordict.keys(True, True)))}."
-            )
-        return value
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict = tensordict.get("next", None)
-        if next_tensordict is None:
-            raise KeyError(
-                "IntrinsicReward needs whole transitions, but the tensordict has no 'next' entry; "
-                "call it on data from a rollout, a collector or a replay buffer."
-            )
-        reward = self._reward(tensordict, next_tensordict)
-        return tensordict.set(unravel_key(("next", self.out_keys[0])), reward)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self.out_keys[0], self._reward(tensordict, next_tensordict))
-
-    def transform_state_spec(self, state_spec: Composite | None) -> Composite:
-        # A parallel env hands its workers the action and what the state spec names, no more:
-        # without these entries a worker would take the root of its own last step for the caller's.
-        if state_spec is None:
-            state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
-        for key in self.in_keys:
-            if key not in state_spec.keys(True, True):
-                state_spec[key] = self._observation_leaf(key).clone()
-        return state_spec
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        direction = self._observation_leaf(self.in_keys[1])
-        reward_spec[self.out_keys[0]] = Unbounded(
-            shape=(*direction.shape[:-1], 1), dtype=direction.dtype, device=direction.device
-        )
-        return reward_spec
-
-    def _observation_leaf(self, key: NestedKey) -> Unbounded:
-        observation_spec = self.parent.full_observation_spec
-        if key not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"IntrinsicReward reads {key!r}, but the env's observations are "
-                f"{sorted(map(str, observation_spec.keys(True, True)))}; put the transform that "
-                "writes it (DirectionPrimer for the direction) before IntrinsicReward."
-            )
-        return observation_spec[key]
+        return (bonus,)

@@ -1,0 +1,42 @@
+"""What losses on pairs of transitions share: who meets whom, and a network's output for all."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+__all__ = ["outputs", "partners"]
+
+
+def partners(
+    samples: int, device: torch.device, pairs: Literal["permuted", "all"] = "permuted"
+) -> Tensor:
+    """Indices [samples, pairs per sample] of the others that each sample is compared with.
+
+    Examples:
+        >>> partners(3, torch.device("cpu"), "all")
+        tensor([[1, 2],
+                [2, 0],
+                [0, 1]])
+    """
+    if samples < 2:
+        raise ValueError("The batch holds one transition; distances need at least two.")
+    if pairs == "all":
+        index = torch.arange(samples, device=device)
+        return (index.unsqueeze(1) + index[1:]) % samples
+    # Neighbors on a random circle: a random permutation that maps no sample to itself.
+    order = torch.randperm(samples, device=device)
+    return torch.empty_like(order).scatter_(0, order, order.roll(1)).unsqueeze(1)
+
+
+def outputs(
+    network: TensorDictModuleBase, params: TensorDictParams, tensordict: TensorDictBase
+) -> Tensor:
+    """A network's first output [samples, size] with these parameters."""
+    with params.to_module(network, preserve_module_state=False):
+        written = network(tensordict.select(*network.in_keys))
+    return written.get(network.out_keys[0]).flatten(0, -2)
