@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch import distributions as D
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 
-from torchrl_etl.modules.actor_critic import Body, make_layers
+from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers, start_small
 
 __all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
 
@@ -260,23 +259,11 @@ def make_dynsyn_actor(
             f"deviate by {_DEVIATION} at most."
         )
     layers = make_layers(sum(inputs.values()), groups.num_groups + n, body, hidden, layer_norm)
-    with torch.no_grad():
-        layers[-1].weight.mul_(0.01)
-        layers[-1].bias.zero_()
+    start_small(layers)
     network = DynSynNetwork(layers, groups, slope=slope, start=start, ceiling=ceiling)
     parameters = ["loc", "scale", "weight_loc", "amplitude"]
-    return ProbabilisticActor(
-        TensorDictModule(network, in_keys=list(inputs), out_keys=parameters),
-        in_keys=parameters,
-        out_keys=[out_key],
-        spec=action_spec,
-        distribution_class=GroupedTanhNormal,
-        distribution_kwargs={
-            "groups": groups,
-            "low": action_spec.space.low,
-            "high": action_spec.space.high,
-        },
-        default_interaction_type=InteractionType.RANDOM,
+    return actor_with(
+        GroupedTanhNormal, network, inputs, parameters, action_spec, out_key, groups=groups
     )
 
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch import distributions as D
@@ -15,7 +14,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from torchrl_etl.modules.actor_critic import Body, make_layers
+from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers
 
 __all__ = [
     "LatticeNetwork",
@@ -313,12 +312,4 @@ def make_lattice_actor(
     else:
         spread = _Spread(hidden[-1], n, log_std_init, (low, high))
     network = LatticeNetwork(layers, spread)
-    return ProbabilisticActor(
-        TensorDictModule(network, in_keys=list(inputs), out_keys=["loc", "scale_tril"]),
-        in_keys=["loc", "scale_tril"],
-        out_keys=[out_key],
-        spec=action_spec,
-        distribution_class=LatticeNormal,
-        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
-        default_interaction_type=InteractionType.RANDOM,
-    )
+    return actor_with(LatticeNormal, network, inputs, ["loc", "scale_tril"], action_spec, out_key)

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded
 
 from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.modules.synergy_decoder import SynergyMap
 
 __all__ = ["SARDecoder", "best_episodes"]
 
@@ -37,7 +36,7 @@ class _AffineSynergies(nn.Module):
         return action.clamp(self.low, self.high)
 
 
-class SARDecoder(TensorDictModule):
+class SARDecoder(SynergyMap):
     """Decodes synergy coefficients into muscle actions by an affine map that does not learn.
 
     It stands wherever a :class:`~torchrl_etl.modules.SynergyDecoder` does, but has no parameters:
@@ -184,16 +183,6 @@ class SARDecoder(TensorDictModule):
     @property
     def high(self) -> Tensor:
         return self.module.high
-
-    @property
-    def synergy_dim(self) -> int:
-        """Entries of the synergy key: d + n, or d without a raw action."""
-        return self.num_synergies + (self.action_dim if self.residual else 0)
-
-    @property
-    def synergy_spec(self) -> Bounded:
-        """What a policy may emit: [-1, 1] in each entry, unbatched."""
-        return Bounded(-1.0, 1.0, shape=(self.synergy_dim,), device=self.low.device)
 
 
 def best_episodes(

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.distributions import Distribution
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_etl.modules.checks import check_choice
 
-__all__ = ["Body", "make_actor", "make_critic", "make_layers"]
+__all__ = ["Body", "actor_with", "make_actor", "make_critic", "make_layers", "start_small"]
 
 
 Body = Literal["mlp", "residual"]
@@ -112,19 +113,48 @@ def make_actor(
         (torch.Size([3, 80]), True)
     """
     layers = make_layers(sum(inputs.values()), 2 * action_spec.shape[-1], body, hidden, layer_norm)
-    # The means start near the middle of the bounds, so that whatever they later vary in was
-    # learned: in stage 1 the GMVAE would otherwise fit the noise of the initialisation.
+    start_small(layers)
+    layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
+    return actor_with(TanhNormal, layers, inputs, ["loc", "scale"], action_spec, out_key)
+
+
+def start_small(layers: nn.Sequential) -> None:
+    """Let an actor's means start near the middle of the bounds.
+
+    Whatever they later vary in was then learned: in stage 1 the GMVAE would otherwise fit the
+    noise of the initialisation.
+    """
     with torch.no_grad():
         layers[-1].weight.mul_(0.01)
         layers[-1].bias.zero_()
-    layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
+
+
+def actor_with(
+    distribution: type[Distribution],
+    network: nn.Module,
+    inputs: Iterable[NestedKey],
+    parameters: Sequence[str],
+    action_spec: TensorSpec,
+    out_key: NestedKey,
+    **kwargs: Any,
+) -> ProbabilisticActor:
+    """An actor that samples from a distribution within the bounds of ``action_spec``.
+
+    Args:
+        distribution (type): built from the parameters, ``low``, ``high`` and ``kwargs``.
+        network (nn.Module): from the inputs to the parameters.
+        inputs, parameters (iterables of keys): what the network reads and writes.
+        action_spec (TensorSpec): one unbatched bounded leaf.
+        out_key (NestedKey): where the sample goes.
+    """
+    bounds = {"low": action_spec.space.low, "high": action_spec.space.high}
     return ProbabilisticActor(
-        TensorDictModule(layers, in_keys=list(inputs), out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
+        TensorDictModule(network, in_keys=list(inputs), out_keys=list(parameters)),
+        in_keys=list(parameters),
         out_keys=[out_key],
         spec=action_spec,
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
+        distribution_class=distribution,
+        distribution_kwargs={**bounds, **kwargs},
         default_interaction_type=InteractionType.RANDOM,
     )
 

@@ -14,7 +14,7 @@ from torchrl.data import Bounded
 
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
 
-__all__ = ["SynergyDecoder"]
+__all__ = ["SynergyDecoder", "SynergyMap"]
 
 
 class _ScaledDecoder(nn.Module):
@@ -37,7 +37,34 @@ class _ScaledDecoder(nn.Module):
         return action.clamp(decoder.low, decoder.high)
 
 
-class SynergyDecoder(TensorDictModule):
+class SynergyMap(TensorDictModule):
+    """What maps synergy coefficients in a box to muscle actions, whatever is inside.
+
+    Attributes:
+        num_synergies (int): number d of synergies.
+        action_dim (int): number n of actuators.
+        residual (float): share of an actuator that the policy moves directly; 0: none.
+        low, high (Tensor): bounds of the action [n].
+    """
+
+    num_synergies: int
+    action_dim: int
+    residual: float
+    low: Tensor
+    high: Tensor
+
+    @property
+    def synergy_dim(self) -> int:
+        """Entries of the synergy key: d, or d + n with a residual."""
+        return self.num_synergies + (self.action_dim if self.residual else 0)
+
+    @property
+    def synergy_spec(self) -> Bounded:
+        """What a policy may emit: [-1, 1] in each entry, unbatched."""
+        return Bounded(-1.0, 1.0, shape=(self.synergy_dim,), device=self.low.device)
+
+
+class SynergyDecoder(SynergyMap):
     """Decoder of synergy coefficients into muscle actions, in the policy's units.
 
     A policy emits u ∈ [-1, 1]^d; the latent is center + scale·u, where center and scale come from
@@ -168,13 +195,3 @@ class SynergyDecoder(TensorDictModule):
     @property
     def high(self) -> Tensor:
         return self.module.decoder.high
-
-    @property
-    def synergy_dim(self) -> int:
-        """Entries of the synergy key: d, or d + n with a residual."""
-        return self.num_synergies + (self.action_dim if self.residual else 0)
-
-    @property
-    def synergy_spec(self) -> Bounded:
-        """What a policy may emit: [-1, 1]^d, unbatched."""
-        return Bounded(-1.0, 1.0, shape=(self.synergy_dim,), device=self.low.device)
