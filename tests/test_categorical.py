@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch.nn.functional import softmax
-from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate
 
+from tests import test_objectives_sac as plain
 from tests import test_objectives_synergy_sac as synergy
 from tests.loss_checks import SEED
 from torchrl_etl.functional import categorical_mean, project_categorical
-from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.objectives import LeanSACLoss
 
 SUPPORT = torch.linspace(-2.0, 2.0, 5)
-GAMMA = 0.9
 
 
 def test_an_atom_goes_to_its_neighbours_by_nearness_and_to_the_ends_beyond_them():
@@ -37,20 +36,7 @@ def test_projection_keeps_the_mass_and_within_the_ends_the_mean():
     torch.testing.assert_close(projected @ SUPPORT, (probabilities * atoms).sum(-1))
 
 
-def make_loss(*, nested: bool = False, **kwargs) -> LeanSACLoss:
-    def at(name: str):
-        return ("agent", name) if nested else name
-
-    spec = Bounded(0.0, 1.0, shape=(5,))
-    loss = LeanSACLoss(
-        make_actor({at("observation"): 3}, spec, out_key=at("action"), hidden=(16,)),
-        make_critic({at("observation"): 3, at("action"): 5}, hidden=(16,), bins=len(SUPPORT)),
-        **{"target_entropy": -1.0, "support": SUPPORT, **kwargs},
-    )
-    if nested:
-        loss.set_keys(**{name: at(name) for name in ("reward", "done", "terminated")})
-    loss.make_value_estimator(gamma=GAMMA)
-    return loss
+make_loss = partial(plain.make_loss, bins=len(SUPPORT), support=SUPPORT)
 
 
 class TestCategoricalSACLoss(synergy.TestSynergySACLoss):
@@ -91,7 +77,7 @@ def test_target_is_the_smaller_critics_distribution_moved_row_by_row():
         expected = torch.zeros(len(SUPPORT))
         for atom, mass in zip(SUPPORT, softmax(logits, -1), strict=True):
             end = data["next", "terminated"][row].item()
-            moved = data["next", "reward"][row, 0] + GAMMA * (not end) * (
+            moved = data["next", "reward"][row, 0] + plain.GAMMA * (not end) * (
                 atom - 0.3 * log_prob[row]
             )
             place = (moved.clamp(-2, 2) + 2).item()  # the support has steps of one

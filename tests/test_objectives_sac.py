@@ -21,7 +21,12 @@ OBSERVATION, ACTION, GAMMA = 3, 5, 0.9
 
 
 def make_loss(
-    kind: type[SACLoss] = LeanSACLoss, *, nested: bool = False, hidden: int = 16, **kwargs: Any
+    kind: type[SACLoss] = LeanSACLoss,
+    *,
+    nested: bool = False,
+    hidden: int = 16,
+    bins: int = 1,
+    **kwargs: Any,
 ) -> SACLoss:
     def at(name: str) -> Any:
         return ("agent", name) if nested else name
@@ -30,7 +35,7 @@ def make_loss(
     network = {"hidden": (hidden, hidden)}
     loss = kind(
         make_actor({at("observation"): OBSERVATION}, spec, out_key=at("action"), **network),
-        make_critic({at("observation"): OBSERVATION, at("action"): ACTION}, **network),
+        make_critic({at("observation"): OBSERVATION, at("action"): ACTION}, bins=bins, **network),
         **{"target_entropy": -1.0, **kwargs},
     )
     if nested:
