@@ -55,7 +55,7 @@ def main(config: DictConfig) -> None:
         with one_sentence(RuntimeError, ValueError):
             videos = record_episodes(
                 experiment.evaluation_env(stage),
-                stage.actor,
+                stage.trained_policy,
                 experiment.folder.path / "videos",
                 episodes=config.video_episodes,
                 size=tuple(config.video_size),

@@ -4,8 +4,10 @@ from torchrl_etl.modules.actor_critic import make_actor, make_critic
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder, Posterior
 from torchrl_etl.modules.held_noise import HeldNoise
 from torchrl_etl.modules.return_scale import ReturnScale
+from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
+from torchrl_etl.modules.unit_rows import normalize_rows
 
 __all__ = [
     "GMVAE",
@@ -14,8 +16,10 @@ __all__ = [
     "HeldNoise",
     "Posterior",
     "ReturnScale",
+    "RunningNorm",
     "StateEncoder",
     "SynergyDecoder",
     "make_actor",
     "make_critic",
+    "normalize_rows",
 ]

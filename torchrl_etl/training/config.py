@@ -67,6 +67,8 @@ _RULES: tuple[_Rule, ...] = (
             "pictures",
             "collector.ahead",
             "learn.reuse_exploration",
+            "learn.sac.normalize_observations",
+            "learn.sac.unit_rows",
             "explore.bonus.normalize",
             "explore.metric.delay_encoder",
             "actor.layer_norm",
@@ -144,7 +146,11 @@ _RULES: tuple[_Rule, ...] = (
         lambda v: _real(v) and 0 < v <= 1,
         ("explore.fit.best_share", "explore.encoder_tau", *_both("sac.tau")),
     ),
-    ("a share in [0, 1]", lambda v: _real(v) and 0 <= v <= 1, ("learn.residual",)),
+    (
+        "a share in [0, 1]",
+        lambda v: _real(v) and 0 <= v <= 1,
+        ("learn.residual", "learn.sac.lr_end"),
+    ),
     (
         "a share in [0, 1)",
         lambda v: _real(v) and 0 <= v < 1,

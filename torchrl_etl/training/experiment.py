@@ -232,7 +232,7 @@ class Experiment:
         steps = episode_length(self.config.env, self.config.goal) or 1000
         return partial(
             evaluate,
-            stage.actor,
+            stage.trained_policy,
             self.evaluation_env(stage),
             episodes=self.config.evaluation.episodes,
             max_steps=steps,

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
-from torchrl_etl.modules import HeldNoise, ReturnScale, make_actor, make_critic
+from torchrl_etl.modules import (
+    HeldNoise,
+    ReturnScale,
+    RunningNorm,
+    make_actor,
+    make_critic,
+    normalize_rows,
+)
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.training.stage import Stage, entropy_target, make_optimizer, ready_for_training
 
 __all__ = ["SACStage"]
 
+NORMALIZED = "normalized_observation"
 Noise = Literal["independent", "held"]
 Losses = tuple[Tensor, TensorDictBase]
 
@@ -37,7 +46,10 @@ class SACStage(Stage):
         sac (mapping): ``gamma``, ``tau``, ``lr``, ``alpha_init``, ``action_std`` (see
             :func:`~torchrl_etl.training.stage.entropy_target`), ``return_bound`` (scale rewards as
             :class:`~torchrl_etl.modules.ReturnScale` does; ``None``: as they are), ``noise``
-            ("independent" at every step or "held" for several).
+            ("independent" at every step or "held" for several), ``normalize_observations`` (actor and
+            critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them), ``unit_rows`` (the rows of all their linear layers keep unit length),
+            ``lr_end`` (share of every learning rate that is left at the last frame; they fall
+            linearly).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:
@@ -63,11 +75,15 @@ class SACStage(Stage):
         check_choice("sac.noise", sac["noise"], get_args(Noise))
         muscles = spec.full_action_spec_unbatched["action"].to(device)
         self.observation_dim = spec.observation_spec["observation"].shape[-1]
-        inputs = {"observation": self.observation_dim}
+        self.norm = None
+        if sac["normalize_observations"]:
+            self.norm = RunningNorm(self.observation_dim).to(device)
+        inputs = {"observation" if self.norm is None else NORMALIZED: self.observation_dim}
         self.action_spec, out_key = self.emitted(muscles)
         self.actor = self.build_actor(inputs, self.action_spec, out_key=out_key, **actor).to(device)
         value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
-        policy = self.policy_of(self.exploring(sac["noise"]))
+        self.trained_policy = self.from_raw(self.actor)
+        policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
         super().__init__(make_env, policy, device=device, **stage)
         bound = sac["return_bound"]
         self.return_scale = None
@@ -81,8 +97,15 @@ class SACStage(Stage):
             support=support(critic.get("bins", 1), bound),
         ).to(device)
         self.sac.set_keys(reward=self.reward)
+        self._unit_rows = list(linear_weights(self.sac)) if sac["unit_rows"] else []
+        self.constrain()
         self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]
         self.optimizer = make_optimizer(device, *self.groups(sac["lr"]))
+        # A function of the frames alone: a resumed run is where it was.
+        falls = 1.0 - sac["lr_end"]
+        self.schedule = LambdaLR(
+            self.optimizer, lambda _: 1.0 - falls * min(1.0, self.frames / self.budget)
+        )
 
     # What other learners fill in ---------------------------------------------------------------
 
@@ -96,6 +119,13 @@ class SACStage(Stage):
     def exploring(self, noise: Noise) -> TensorDictModuleBase:
         """The actor as it collects."""
         return HeldNoise(self.actor) if noise == "held" else self.actor
+
+    def from_raw(self, actor: TensorDictModuleBase) -> TensorDictModuleBase:
+        """The actor as it reads the environment's own observations."""
+        if self.norm is None:
+            return actor
+        norm = TensorDictModule(self.norm, in_keys=["observation"], out_keys=[NORMALIZED])
+        return TensorDictSequential(norm, actor)
 
     def target_entropy(self, action_std: float | None) -> float | str:
         return entropy_target(self.action_spec, action_std)
@@ -111,7 +141,17 @@ class SACStage(Stage):
         """Trained parameters with their learning rates."""
         return [(list(self.sac.parameters()), lr)]
 
+    def constrain(self) -> None:
+        if self._unit_rows:
+            normalize_rows(self._unit_rows)
+
     # What a stage defines ----------------------------------------------------------------------
+
+    def learn(self) -> TensorDictBase | None:
+        logs = super().learn()
+        if self.progress.updates:
+            self.schedule.step()
+        return logs
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = batch.select(*self.kept, ("next", "observation"))
@@ -120,8 +160,15 @@ class SACStage(Stage):
         return kept
 
     def losses(self, batch: TensorDictBase) -> Losses:
-        out = self.sac(self.scaled(batch))
+        out = self.sac(self.scaled(self.observed(batch)))
         return out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"], out
+
+    def observed(self, batch: TensorDictBase) -> TensorDictBase:
+        """The batch with the observations that actor and critics read."""
+        if self.norm is None:
+            return batch
+        batch = batch.copy().set(NORMALIZED, self.norm(batch["observation"]))
+        return batch.set(("next", NORMALIZED), self.norm(batch["next", "observation"]))
 
     def scaled(self, batch: TensorDictBase) -> TensorDictBase:
         """The batch with its rewards in the units of what was seen up to now."""
@@ -132,13 +179,13 @@ class SACStage(Stage):
 
     def acting(self) -> dict[str, Any]:
         """The parts that a trained policy consists of."""
-        return {"actor": self.actor}
+        return {"actor": self.trained_policy}
 
     def parts(self) -> dict[str, Any]:
         parts = {"sac": self.sac, "optimizer": self.optimizer, **self.acting()}
         return parts if self.return_scale is None else parts | {"return_scale": self.return_scale}
 
-    # What rewards are scaled by ----------------------------------------------------------------
+    # What rewards and observations are scaled by -----------------------------------------------
 
     def restart_collection(self) -> None:
         if self.return_scale is not None:
@@ -149,7 +196,15 @@ class SACStage(Stage):
         if self.return_scale is not None:
             reward = self.reward_scale * batch["next", "reward"]
             self.return_scale.update(reward.squeeze(-1), batch["next", "done"].squeeze(-1))
+        if self.norm is not None:
+            self.norm.update(batch["observation"])
         return batch
+
+
+def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
+    """Weights of the linear layers of actor [out, in] and stacked critics [critics, out, in]."""
+    for params, ndim in ((sac.actor_network_params, 2), (sac.qvalue_network_params, 3)):
+        yield from (p for p in params.parameters() if p.ndim == ndim)
 
 
 def support(bins: int, bound: float | None) -> Tensor | None:

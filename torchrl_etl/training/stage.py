@@ -201,6 +201,7 @@ class Stage(ABC):
         for parameter, gradient in zip(self._trained(), gradients, strict=True):
             parameter.grad = gradient
         self.optimizer.step()
+        self.constrain()
         for target in self.targets:
             target.step()
         return scalars
@@ -209,6 +210,9 @@ class Stage(ABC):
         """Gradients of what is trained, and the scalars to log."""
         loss, scalars = self.losses(batch)
         return torch.autograd.grad(loss, self._trained(), allow_unused=True), scalars.detach()
+
+    def constrain(self) -> None:
+        """Bring parameters back to where they must lie, after every step of the optimizer."""
 
     def _trained(self) -> list[Tensor]:
         return [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
@@ -272,12 +276,18 @@ def ready_for_training(sac: SACLoss, *, gamma: float, tau: float) -> SoftUpdate:
 def make_optimizer(device: torch.device, *groups: tuple[Iterable[Tensor], float]) -> Adam:
     """Adam for several groups of parameters, each with its learning rate.
 
-    All groups take their step in one operation, which a CUDA graph can hold.
+    All groups take their step in one operation, which a CUDA graph can hold; it reads learning
+    rates from tensors there, so that they can change.
     """
+    graphed = device.type == "cuda"
+    rates = [torch.tensor(lr, device=device) if graphed else lr for _, lr in groups]
     return Adam(
-        [{"params": list(parameters), "lr": lr} for parameters, lr in groups],
+        [
+            {"params": list(parameters), "lr": lr}
+            for (parameters, _), lr in zip(groups, rates, strict=True)
+        ],
         fused=True,
-        capturable=device.type == "cuda",
+        capturable=graphed,
     )
 
 
