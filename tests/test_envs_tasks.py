@@ -5,8 +5,9 @@ import sys
 
 import gymnasium as gym
 import pytest
+import torch
 
-from torchrl_etl.envs import episode_length, list_tasks, resolve_task
+from torchrl_etl.envs import episode_length, list_tasks, make_env, resolve_task
 
 PAPER = {
     "myoHandPose": "myoHandPoseFixed-v0",
@@ -100,3 +101,29 @@ def test_paper_names_resolve_without_importing_a_simulator():
         "sys.exit(any(m in sys.modules for m in ('myosuite', 'dm_control')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "random_actions_drop"),
+    [("myoBaoding", True), ("myoDieReorient", True), ("myoRelocate", False)],
+)
+def test_a_drop_ends_nothing_where_episodes_are_full(name, random_actions_drop):
+    torch.manual_seed(0)
+    full = make_env(f"{name}Full", seed=0).rollout(1000)
+    ends = full["next", "done"].squeeze(-1).nonzero().flatten().tolist()
+    assert ends == [episode_length(name) - 1] and not full["next", "terminated"].any()
+    assert full["next", "truncated"][-1]
+    torch.manual_seed(0)
+    early = make_env(name, seed=0).rollout(1000)
+    steps = len(early)
+    assert (steps < len(full)) == random_actions_drop
+    # Until then both are the same; only the early end is gone.
+    torch.testing.assert_close(full["next", "observation"][:steps], early["next", "observation"])
+    torch.testing.assert_close(full["next", "reward"][:steps], early["next", "reward"])
+
+
+def test_full_episodes_are_tasks_beside_the_papers_and_the_ids_keep_their_meaning():
+    assert resolve_task("myoBaodingFull").env_id == resolve_task("myoBaoding").env_id
+    assert resolve_task("myoChallengeBaodingP1-v1").ends_early
+    assert not any(task.name.endswith("Full") for task in list_tasks())

@@ -20,6 +20,7 @@ from torchrl_etl.envs.wrappers import (
     SUCCESS_KEYS,
     FiniteGuard,
     FlatObservation,
+    FullEpisodes,
     NamedObservation,
     SeededVectorEnv,
 )
@@ -193,6 +194,8 @@ def _build(
         env = FlatObservation(env)
     elif not isinstance(space, spaces.Box) or len(space.shape) != 1:
         env = FlattenObservation(env)
+    if not task.ends_early:
+        env = FullEpisodes(env)
     env = FiniteGuard(env, task.name, faults)
     return NamedObservation(
         env, success_key, activations=activations, muscle_lengths=muscle_lengths

@@ -35,6 +35,7 @@ class Task:
         solved: Whether the task says when it is solved; ``None`` means that :func:`make_env`
             finds out with one step.
         goal: Which of the two goals is meant.
+        ends_early: Whether an episode can end before its time; if not, the simulation goes on.
 
     Examples:
         >>> from torchrl_etl.envs import resolve_task
@@ -49,6 +50,7 @@ class Task:
     episode_steps: int | None = None
     solved: bool | None = None
     goal: Goal = "fixed"
+    ends_early: bool = True
 
     @property
     def env_id(self) -> str:
@@ -98,10 +100,18 @@ _ANALYTIC = Task(
     True,
 )
 
-_BY_NAME = {task.name: task for task in (*_PAPER, _ANALYTIC)}
+# Their rewards are negative and a drop ends them, so that dropping early can pay. Where it ends
+# nothing, it does not.
+_FULL = tuple(
+    replace(task, name=f"{task.name}Full", ends_early=False)
+    for task in _PAPER
+    if task.name in ("myoBaoding", "myoDieReorient", "myoRelocate")
+)
+
+_BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _ANALYTIC)}
 _BY_ID = {
     env_id: replace(task, goal=goal)
-    for task in _BY_NAME.values()
+    for task in (*_PAPER, _ANALYTIC)
     if task.suite != "dm_control"
     for goal, env_id in zip(("fixed", "random"), (task.id, task.random_id), strict=True)
     if env_id is not None

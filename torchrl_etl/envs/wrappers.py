@@ -19,6 +19,7 @@ __all__ = [
     "SUCCESS_KEYS",
     "FiniteGuard",
     "FlatObservation",
+    "FullEpisodes",
     "NamedObservation",
     "SeededVectorEnv",
     "SimulationError",
@@ -46,6 +47,18 @@ class FlatObservation(gym.ObservationWrapper):
 
     def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         return np.concatenate([np.ravel(observation[key]) for key in self._keys])
+
+
+class FullEpisodes(gym.Wrapper):
+    """Goes on where an episode would end early, until its time limit truncates it.
+
+    Where rewards are negative, an early end is worth having; a simulation that goes on takes that
+    worth away, and invents no reward in its place.
+    """
+
+    def step(self, action: np.ndarray):
+        observation, reward, _, truncated, info = self.env.step(action)
+        return observation, reward, False, truncated, info
 
 
 class FiniteGuard(gym.Wrapper):

@@ -46,10 +46,10 @@ class SACStage(Stage):
         sac (mapping): ``gamma``, ``tau``, ``lr``, ``alpha_init``, ``action_std`` (see
             :func:`~torchrl_etl.training.stage.entropy_target`), ``return_bound`` (scale rewards as
             :class:`~torchrl_etl.modules.ReturnScale` does; ``None``: as they are), ``noise``
-            ("independent" at every step or "held" for several), ``normalize_observations`` (actor and
-            critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them), ``unit_rows`` (the rows of all their linear layers keep unit length),
-            ``lr_end`` (share of every learning rate that is left at the last frame; they fall
-            linearly).
+            ("independent" at every step or "held" for several), ``normalize_observations`` (actor
+            and critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
+            ``unit_rows`` (the rows of all their linear layers keep unit length) and ``lr_end``
+            (share of every learning rate that is left at the last frame; they fall linearly).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:

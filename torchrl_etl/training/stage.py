@@ -211,7 +211,7 @@ class Stage(ABC):
         loss, scalars = self.losses(batch)
         return torch.autograd.grad(loss, self._trained(), allow_unused=True), scalars.detach()
 
-    def constrain(self) -> None:
+    def constrain(self) -> None:  # noqa: B027 (most stages have nothing to do here)
         """Bring parameters back to where they must lie, after every step of the optimizer."""
 
     def _trained(self) -> list[Tensor]:
