@@ -23,6 +23,12 @@ from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
 
 WALL_CLOCK = ("frames_per_second", "wall_seconds")
+# With all that remembers what was seen, or goes by the frames.
+REMEMBERS = (
+    "learn.sac.normalize_observations=true",
+    "learn.sac.return_bound=5",
+    "learn.sac.lr_end=0.5",
+)
 
 
 def numbers(run: Path) -> dict[str, str]:
@@ -41,7 +47,7 @@ def numbers(run: Path) -> dict[str, str]:
 
 def command(run: Path, *overrides: str) -> list[str]:
     recipe = [sys.executable, str(ROOT / "recipes" / "etl_sac.py")]
-    return [*recipe, *TINY, f"run_dir='{run}'", *overrides]
+    return [*recipe, *TINY, *REMEMBERS, f"run_dir='{run}'", *overrides]
 
 
 def start(arguments: list[str], log: Path) -> subprocess.Popen:
@@ -78,7 +84,7 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> Non
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory) -> dict[str, str]:
     run = tmp_path_factory.mktemp("whole") / "run"
-    Experiment(tiny(f"run_dir='{run}'")).run()
+    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
     return numbers(run)
 
 
@@ -102,7 +108,7 @@ def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(
 
 def test_killed_before_the_first_checkpoint_starts_that_stage_over(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
     experiment.folder.open(resume=False)
     experiment.folder.log({"explore/return": 1.0, "learn/eval/return": 2.0}, 0)
     Experiment(resumed_config(run), resume=run).run()
@@ -111,7 +117,7 @@ def test_killed_before_the_first_checkpoint_starts_that_stage_over(tmp_path, uni
 
 def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    Experiment(tiny(f"run_dir='{run}'", "seed=1")).run()
+    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "seed=1")).run()
     other = numbers(run)
     assert other.keys() == uninterrupted.keys()
     assert other["csv/scalars/learn/return.csv"] != uninterrupted["csv/scalars/learn/return.csv"]
@@ -119,7 +125,7 @@ def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted)
 
 def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    Experiment(tiny(f"run_dir='{run}'")).run()
+    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
     newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
     victim = next(path for path in newest.rglob("*.memmap") if path.stat().st_size)
     content = bytearray(victim.read_bytes())
@@ -161,7 +167,7 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatch):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
     stage = experiment.explore_stage()
     monkeypatch.setattr(experiment, "explore_stage", lambda: stage)
     collect = stage.collect
@@ -184,7 +190,7 @@ def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatc
 
 def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_path):
     run = tmp_path / "run"
-    Experiment(tiny(f"run_dir='{run}'")).run()
+    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
     for seal in (run / "checkpoints" / "learn").glob("*/seal.json"):
         seal.write_text("{}")
     with (
@@ -196,7 +202,7 @@ def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_pa
 
 def test_a_checkpoint_that_could_run_code_is_not_loaded(tmp_path):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(f"run_dir='{run}'"))
+    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
     experiment.run()
     newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
     assert {path.suffix for path in newest.rglob("*") if path.is_file()} == {".json", ".memmap"}
@@ -216,7 +222,7 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
 ):
     run = tmp_path / "run"
     settings = ("pictures=true", "explore.frames=320", slow_part)
-    experiment = Experiment(tiny(f"run_dir='{run}'", *settings))
+    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", *settings))
     save = Checkpoints.save
 
     def save_and_signal(self, checkpoint, *, step, **kwargs):
@@ -237,7 +243,7 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
 
 def test_a_longer_budget_can_be_given_when_resuming(tmp_path):
     run = tmp_path / "run"
-    Experiment(tiny(f"run_dir='{run}'", "learn.frames=320")).run()
+    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "learn.frames=320")).run()
     longer = resumed_config(run, ["learn.frames=640", f"resume={run}"])
     summary = Experiment(longer, resume=run).run()
     assert summary["learn"]["frames"] == 640
