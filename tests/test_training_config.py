@@ -63,6 +63,8 @@ def test_every_task_of_the_paper_is_valid(task):
         ("explore.fit.actions=activation", "activation"),
         ("learn.critic.bins=51", "which needs a bound on returns"),
         ("learn.sac.noise=hold", "choose one of independent, held"),
+        ("learn.sac.lr_end=2", "lr_end is 2; it must be a share in [0, 1]"),
+        ("learn.sac.unit_rows=1", "unit_rows is 1; it must be true or false"),
         ("critic.body=resnet", "choose one of mlp, residual"),
         ("frames=10", "frames is 10, of which 600 go into"),
         ("actor.hidden=[0]", "actor.hidden is [0]; it must be a list of whole numbers"),
