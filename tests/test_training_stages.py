@@ -91,6 +91,27 @@ def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp
     stage.close()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("engine", "oldest"), [("single", 1), ("process", 1), ("distributed", 2)])
+def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
+    # A worker on another machine is asked for a batch before the last one is learned from.
+    settings = ("method=sac", f"collector={engine}", "collector.ahead=false")
+    settings += () if engine == "single" else ("collector.num_workers=1",)
+    settings += ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
+    stage = Experiment(tiny(*settings)).learn_stage(None)
+    try:
+        stage.restart_collection()
+        known = []
+        for _ in range(6):
+            stage.collect()
+            known.append(copy.deepcopy(stage.norm))
+        batch = stage.batches.next()
+        acted = batch["normalized_observation"]
+        assert any(torch.allclose(acted, norm(batch["observation"])) for norm in known[-oldest:])
+    finally:
+        stage.close()
+
+
 def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(tmp_path):
     settings = ("learn.sac.unit_rows=true", "learner=residual", f"run_dir={tmp_path}")
     stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
