@@ -14,21 +14,21 @@ SEEN = torch.tensor([[1.0, -3.0, 7.0], [2.0, 5.0, 7.0], [6.0, 1.0, 7.0], [3.0, 9
 def test_output_is_in_deviations_from_the_mean_of_all_that_was_seen(cuts):
     norm = RunningNorm(3)
     for part in SEEN.tensor_split(cuts):
-        norm.update(part)
+        norm.see(part)
     expected = (SEEN - SEEN.mean(0)) / SEEN.std(0, correction=0)
     torch.testing.assert_close(norm(SEEN)[:, :2], expected[:, :2])
 
 
 def test_an_entry_that_never_varied_is_only_centred():
     norm = RunningNorm(3)
-    norm.update(SEEN)
+    norm.see(SEEN)
     assert norm(torch.tensor([0.0, 0.0, 8.0]))[2] == 1.0
 
 
 def test_batches_of_any_shape_count_as_rows():
     norm, flat = RunningNorm(3), RunningNorm(3)
-    norm.update(SEEN.view(2, 2, 3))
-    flat.update(SEEN)
+    norm.see(SEEN.view(2, 2, 3))
+    flat.see(SEEN)
     torch.testing.assert_close(norm(SEEN.view(2, 2, 3)), flat(SEEN).view(2, 2, 3))
 
 
@@ -38,13 +38,13 @@ def test_nothing_seen_leaves_observations_as_they_are():
 
 def test_outliers_are_clipped():
     norm = RunningNorm(3, clip=2.0)
-    norm.update(SEEN)
+    norm.see(SEEN)
     assert norm(SEEN + 1e6).max() == 2.0
 
 
-def test_only_update_changes_the_statistics_and_they_survive_a_round_trip():
+def test_only_seeing_changes_the_statistics_and_they_survive_a_round_trip():
     norm, other = RunningNorm(3), RunningNorm(3)
-    norm.update(SEEN)
+    norm.see(SEEN)
     before = norm(SEEN)
     norm.train()(SEEN * 100)
     other.load_state_dict(norm.state_dict())

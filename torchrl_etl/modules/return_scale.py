@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from torchrl_etl.modules.running_moments import RunningMoments
 
 __all__ = ["ReturnScale"]
 
 
-class ReturnScale(nn.Module):
+class ReturnScale(RunningMoments):
     """Divides rewards so that returns deviate by about one and stay within a bound.
 
     Per simulator it follows the discounted sum of the rewards so far, G_t = r_t + γ G_{t-1}, zero
@@ -41,8 +43,7 @@ class ReturnScale(nn.Module):
         if not bound > 0.0:
             raise ValueError(f"bound is {bound}; it is the largest return and must be above 0.")
         self.gamma, self.bound = gamma, bound
-        for name in ("count", "mean", "squares", "largest"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.float64))
+        self.register_buffer("largest", torch.zeros((), dtype=torch.float64))
         self.forget()
 
     def forget(self) -> None:
@@ -59,23 +60,14 @@ class ReturnScale(nn.Module):
             seen.append(now + self.gamma * sums)
             sums = torch.where(ends, 0.0, seen[-1])
         self._sums = sums
-        self._see(torch.stack(seen))
-
-    def _see(self, values: Tensor) -> None:
-        # Chan's parallel variance: exact, whatever the batches are.
-        count, mean = self.count + values.numel(), values.mean()
-        squares = (values - mean).square().sum()
-        shift = mean - self.mean
-        self.squares += squares + shift.square() * self.count * values.numel() / count
-        self.mean += shift * values.numel() / count
-        self.count.copy_(count)
+        values = torch.stack(seen)
+        self.see(values)
         self.largest.copy_(torch.maximum(self.largest, values.abs().max()))
 
     @property
     def scale(self) -> Tensor:
         """What rewards are divided by; one before anything was seen."""
-        std = (self.squares / self.count.clamp(min=1)).sqrt()
-        scale = torch.maximum(std, self.largest / self.bound)
+        scale = torch.maximum(self.variance.sqrt(), self.largest / self.bound)
         return torch.where(scale > 1e-8, scale, 1.0)
 
     def forward(self, reward: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ class LearnStage(SACStage):
         missing = self.decoder.synergy_dim - rows["synergy"].shape[-1]
         rows = rows.copy().set("synergy", nn.functional.pad(rows["synergy"], (0, missing)))
         if self.norm is not None:
-            self.norm.update(rows["observation"])
+            self.norm.see(rows["observation"])
         self.buffer.extend(self.transitions(rows))
         self.progress.owed += len(rows) * self.updates_per_frame
 

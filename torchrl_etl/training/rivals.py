@@ -152,7 +152,7 @@ class EMEStage(SACStage):
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         loss, scalars = super().losses(batch)
-        metric = self.metric(self.observed(batch))
+        metric = self.metric(batch)
         scalars.update(metric).set("bonus", batch["next", "intrinsic_reward"].mean())
         return loss + metric["loss_metric"] + metric["loss_reward_ensemble"], scalars
 

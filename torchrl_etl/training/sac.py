@@ -159,8 +159,11 @@ class SACStage(Stage):
         kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
         return kept
 
+    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+        return super().gradients(self.observed(batch))
+
     def losses(self, batch: TensorDictBase) -> Losses:
-        out = self.sac(self.scaled(self.observed(batch)))
+        out = self.sac(self.scaled(batch))
         return out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"], out
 
     def observed(self, batch: TensorDictBase) -> TensorDictBase:
@@ -197,7 +200,7 @@ class SACStage(Stage):
             reward = self.reward_scale * batch["next", "reward"]
             self.return_scale.update(reward.squeeze(-1), batch["next", "done"].squeeze(-1))
         if self.norm is not None:
-            self.norm.update(batch["observation"])
+            self.norm.see(batch["observation"])
         return batch
 
 

@@ -280,11 +280,10 @@ def make_optimizer(device: torch.device, *groups: tuple[Iterable[Tensor], float]
     rates from tensors there, so that they can change.
     """
     graphed = device.type == "cuda"
-    rates = [torch.tensor(lr, device=device) if graphed else lr for _, lr in groups]
     return Adam(
         [
-            {"params": list(parameters), "lr": lr}
-            for (parameters, _), lr in zip(groups, rates, strict=True)
+            {"params": list(of), "lr": torch.tensor(lr, device=device) if graphed else lr}
+            for of, lr in groups
         ],
         fused=True,
         capturable=graphed,

@@ -1,0 +1,48 @@
+"""Mean and variance of everything seen so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["RunningMoments"]
+
+
+class RunningMoments(nn.Module):
+    """Moments of the values seen, in double precision; buffers, so that they are saved and sent.
+
+    Args:
+        shape (sequence of int): of one value. Default: a number.
+
+    Examples:
+        >>> import torch
+        >>> moments = RunningMoments()
+        >>> moments.see(torch.tensor([1.0, 3.0]))
+        >>> moments.mean.item(), moments.variance.item()
+        (2.0, 1.0)
+    """
+
+    def __init__(self, shape: Sequence[int] = ()) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        for name in ("mean", "squares"):
+            self.register_buffer(name, torch.zeros(tuple(shape), dtype=torch.float64))
+
+    @torch.no_grad()
+    def see(self, values: Tensor) -> None:
+        """Take in values [*, *shape]."""
+        rows = values.reshape(-1, *self.mean.shape).to(self.mean)
+        # Chan's parallel variance: exact, whatever the batches are.
+        count, mean = self.count + len(rows), rows.mean(0)
+        shift = mean - self.mean
+        self.squares += (rows - mean).square().sum(0)
+        self.squares += shift.square() * self.count * len(rows) / count
+        self.mean += shift * len(rows) / count
+        self.count.copy_(count)
+
+    @property
+    def variance(self) -> Tensor:
+        """Of all that was seen; zero before."""
+        return self.squares / self.count.clamp(min=1)
