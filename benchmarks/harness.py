@@ -21,11 +21,13 @@ __all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy"]
 
 CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
+PLAIN = ("learner=plain", "num_synergies=4", "learn.residual=0")
+
 
 def recipe(*overrides: str) -> DictConfig:
-    """The configuration of ``recipes/etl_sac.py`` with these overrides, as plain SAC does it."""
+    """The configuration of ``recipes/etl_sac.py`` with these, for plain networks and synergies."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=["learner=plain", *overrides])
+        return compose("config", overrides=[*PLAIN, *overrides])
 
 
 def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:

@@ -33,6 +33,7 @@ def explore(env: str, reading: str, seed: int, frames: int) -> dict[str, object]
             f"faithful={reading}",
             f"seed={seed}",
             f"explore.frames={frames}",
+            "num_synergies=4",
             "stage=explore",
             "pictures=false",
             "threads=1",

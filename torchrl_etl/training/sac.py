@@ -46,8 +46,9 @@ class SACStage(Stage):
         sac (mapping): ``gamma``, ``tau``, ``lr``, ``alpha_init``, ``action_std`` (see
             :func:`~torchrl_etl.training.stage.entropy_target`), ``return_bound`` (scale rewards as
             :class:`~torchrl_etl.modules.ReturnScale` does; ``None``: as they are), ``noise``
-            ("independent" at every step or "held" for several), ``normalize_observations`` (actor
-            and critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
+            ("independent" at every step or "held" for several), ``hold`` (keyword arguments of
+            :class:`~torchrl_etl.modules.HeldNoise`), ``normalize_observations`` (actor and
+            critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
             ``unit_rows`` (the rows of all their linear layers keep unit length) and ``lr_end``
             (share of every learning rate that is left at the last frame; they fall linearly).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
@@ -73,6 +74,7 @@ class SACStage(Stage):
     ) -> None:
         torch.manual_seed(stage["seed"])
         check_choice("sac.noise", sac["noise"], get_args(Noise))
+        self.hold = sac["hold"]
         muscles = spec.full_action_spec_unbatched["action"].to(device)
         self.observation_dim = spec.observation_spec["observation"].shape[-1]
         self.norm = None
@@ -118,7 +120,7 @@ class SACStage(Stage):
 
     def exploring(self, noise: Noise) -> TensorDictModuleBase:
         """The actor as it collects."""
-        return HeldNoise(self.actor) if noise == "held" else self.actor
+        return HeldNoise(self.actor, **self.hold) if noise == "held" else self.actor
 
     def from_raw(self, actor: TensorDictModuleBase) -> TensorDictModuleBase:
         """The actor as it reads the environment's own observations."""
