@@ -73,6 +73,16 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice"])  # losses or actors of their own
+def test_a_rival_compiles(method, tmp_path):
+    stage = Experiment(config(method, tmp_path / "run", "compile=true")).learn_stage(None)
+    stage.restart_collection()
+    stage.collect()
+    assert all(value.isfinite().all() for value in stage.update().values())
+    stage.close()
+
+
+@pytest.mark.slow
 def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     experiment = Experiment(config("dynsyn", tmp_path / "run"))
     groups = experiment.run()["groups"]

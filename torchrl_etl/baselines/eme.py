@@ -356,9 +356,10 @@ class EMELoss(LossModule):
         The divergence of two Gaussians is that of their images under one invertible map, so the
         tanh and the bounds of the action do not matter.
         """
-        inputs = tensordict.select(*self.actor.in_keys)
-        # The loss may have been cast without the actor.
+        # The loss may have been cast without the actor. Entry by entry: torch.compile (2.13) cannot
+        # trace TensorDict.to.
         parameter = next(self.actor.parameters(), like)
-        inputs = inputs.to(parameter.device, parameter.dtype)
+        entries = {key: tensordict.get(key).to(parameter) for key in self.actor.in_keys}
+        inputs = TensorDict(entries, tensordict.batch_size)
         written = self.actor.get_dist_params(inputs)
         return [written.get(key).flatten(0, -2).to(like) for key in self.policy_keys]
