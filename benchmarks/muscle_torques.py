@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import mujoco
@@ -18,7 +19,7 @@ import numpy as np
 
 from torchrl_etl.command_line import one_sentence
 from torchrl_etl.envs import make_env
-from torchrl_etl.envs.simulator import simulator
+from torchrl_etl.envs.simulator import mujoco_state, simulator
 
 
 def main() -> None:
@@ -30,28 +31,29 @@ def main() -> None:
     with one_sentence(ValueError, OSError):
         env = make_env(arguments.task, seed=0)
         env.reset()
-        rows = list(torques(simulator(env), arguments.joints))
-    with arguments.out.open("w", newline="") if arguments.out else sys.stdout as file:
+        rows = list(torques(env, arguments.joints))
+    out = arguments.out
+    with out.open("w", newline="", encoding="utf-8") if out else nullcontext(sys.stdout) as file:
         writer = csv.DictWriter(file, ["joint", "muscle", "torque"], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def torques(simulation, parts):
+def torques(env, parts):
     """Rows for the joints whose names contain one of these parts, the strongest muscle first."""
-    model, data = simulation.model, mujoco.MjData(simulation.model)
+    model, now = mujoco_state(env)
     joints = [j for j in range(model.njnt) if any(part in model.joint(j).name for part in parts)]
     if not joints:
         names = ", ".join(model.joint(j).name for j in range(model.njnt))
         raise ValueError(f"No joint's name contains any of {parts}; there are {names}.")
-    data.qpos[:] = getattr(simulation, "target_jnt_value", simulation.data.qpos)
-    forces = np.empty((model.na + 1, model.nv))
-    for muscle in range(-1, model.na):  # -1: all are off, which leaves passive forces
-        data.act[:] = 0.0
-        data.act[max(muscle, 0)] = float(muscle >= 0)
+    data = mujoco.MjData(model)
+    data.qpos[:] = getattr(simulator(env), "target_jnt_value", now.qpos)
+    forces = []
+    for activation in (np.zeros(model.na), *np.eye(model.na)):
+        data.act[:] = activation
         mujoco.mj_forward(model, data)
-        forces[muscle] = data.qfrc_actuator
-    active = forces[:-1] - forces[-1]
+        forces.append(data.qfrc_actuator.copy())
+    active = np.array(forces[1:]) - forces[0]  # less the passive forces of stretched muscles
     for joint in joints:
         torque = active[:, model.jnt_dofadr[joint]]
         for muscle in np.argsort(-np.abs(torque)):
