@@ -237,6 +237,20 @@ def test_budget_is_the_most_that_all_runs_share(tmp_path):
     assert [one.method for one in comparison.stale] == ["sac"]
 
 
+def test_a_batch_more_or_less_at_the_end_changes_nothing(tmp_path):
+    sac = run([0, 1, 2], [0, 45_056, 50_048])
+    sar = run([0, 3, 4], [0, 45_064, 50_056], method="sar")
+    late = run([0, 5, 6], [0, 49_000, 50_600], method="etl")
+    runs = bench(tmp_path, sac, sar, late).runs
+    for frames in (50_000, None):
+        comparison = compare(runs, ["sac", "sar", "etl"], "sac", frames=frames, repetitions=FEW)
+        assert comparison.budget == (frames or 50_048)
+        assert comparison.result("sac").returns.tolist() == [2.0]
+        assert comparison.result("sar").returns.tolist() == [4.0]
+        assert not comparison.short and not comparison.stale
+    assert compare(runs, ["etl"], "sac", frames=50_000).result("etl").returns.tolist() == [5.0]
+
+
 def test_runs_that_end_before_an_asked_budget_are_left_out(tmp_path):
     runs = bench(tmp_path, run([0, 1, 2, 3]), run([0, 5], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", frames=150_000, repetitions=FEW)

@@ -30,12 +30,13 @@ from torchrl_etl.modules.atomic_files import write_atomically
 __all__ = ["write_report"]
 
 HOW_TO_READ = """\
-How to read the tables. A run counts with its last evaluation at or before the budget; nothing is \
-interpolated. `mean` and the range are over seeds. `IQM` is the interquartile mean (of three seeds \
-or fewer: the mean) with the percentile bootstrap's 95 % interval, seeds resampled within each \
-task (rliable); of two seeds it is their range. `P(> {control})` is the probability that a run \
-beats a run of {control}, a tie counting one half. One seed says nothing about spread and gets no \
-interval. `solved` is the share of episodes, `solved time` the share of steps."""
+How to read the tables. A run counts with its last evaluation up to 1 % past the budget, since it \
+ends with a whole batch; nothing is interpolated. `mean` and the range are over seeds. `IQM` is \
+the interquartile mean (of three seeds or fewer: the mean) with the percentile bootstrap's 95 % \
+interval, seeds resampled within each task (rliable); of two seeds it is their range. \
+`P(> {control})` is the probability that a run beats a run of {control}, a tie counting one half. \
+One seed says nothing about spread and gets no interval. `solved` is the share of episodes, \
+`solved time` the share of steps."""
 
 
 def write_report(
