@@ -175,6 +175,31 @@ def test_pen_twirl_truncates_at_its_limit_and_terminates_on_a_drop(excitation, l
     assert not rollout["next", "done"][:-1].any()
 
 
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_a_repeated_action_adds_up_its_rewards_within_the_episode(num_envs):
+    """Each step pays 1, is solved from the second on, and the limit is four of the simulator's."""
+    env = make_env(PLANTED, num_envs=num_envs, action_repeat=3, seed=0)
+    check_env_specs(env, seed=0)
+    rollout = env.rollout(9)["next"].reshape(-1, 2)
+    for following in rollout:
+        assert following["reward"].flatten().tolist() == [3, 1]
+        assert following["observation"][:, 0].tolist() == [3, 4]
+        assert following["solved"].all()
+        assert following["truncated"].flatten().tolist() == [False, True]
+
+
+def test_a_repeated_action_is_the_same_action_twice():
+    once, twice = make_env("myoHandPose", seed=0), make_env("myoHandPose", action_repeat=2, seed=0)
+    actions = some_actions(once, 4)
+    single = replay(once, 5, [action for action in actions for _ in range(2)])
+    double = replay(twice, 5, actions)
+    assert_identical(
+        [step["observation"] for step in single[::2]], [x["observation"] for x in double]
+    )
+    rewards = [a["reward"] + b["reward"] for a, b in zip(single[1::2], single[2::2], strict=True)]
+    torch.testing.assert_close(rewards, [step["reward"] for step in double[1:]])
+
+
 @pytest.mark.slow
 def test_time_limit_of_dm_control_truncates():
     rollout = make_env("humanoid-stand", seed=0).rollout(1001)
@@ -260,6 +285,11 @@ def test_discrete_actions_are_refused():
 def test_a_wrong_number_of_envs_is_refused(num_envs):
     with pytest.raises(ValueError, match="num_envs must be a positive integer"):
         make_env("overactuated", num_envs=num_envs)
+
+
+def test_a_wrong_number_of_repetitions_is_refused():
+    with pytest.raises(ValueError, match="action_repeat must be a positive integer, got 0"):
+        make_env("overactuated", action_repeat=0)
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])

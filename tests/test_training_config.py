@@ -38,6 +38,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("stage=lern", "stage is 'lern'; choose one of explore, learn, all (nearest: learn)"),
         ("goal=fix", "fixed"),
         ("num_synergies=0", "num_synergies is 0; it must be a whole number above 0"),
+        ("action_repeat=0", "action_repeat is 0; it must be a whole number above 0"),
         ("num_synergies=17", "overactuated has 16 actuators; choose at most that many"),
         ("explore.frames=-5", "explore.frames is -5; it must be a whole number above 0"),
         ("learn.frames=many", "learn.frames is 'many'; it must be a whole number above 0"),

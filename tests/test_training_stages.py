@@ -314,6 +314,29 @@ def test_updates_keep_the_ratio_that_was_asked_for():
     stage.close()
 
 
+def test_frames_are_steps_of_the_simulator_however_long_an_action_lasts(tmp_path):
+    run = Experiment(
+        tiny(
+            f"run_dir={tmp_path}/run",
+            "action_repeat=2",
+            "explore.frames=256",
+            "explore.updates_per_frame=0.25",
+            "explore.learning_starts=0",
+            "learn.frames=128",
+        )
+    )
+    stage = run.explore_stage()
+    stage.restart_collection()
+    stage.collect(), stage.learn()  # 32 actions
+    assert stage.frames == 64 and len(stage.buffer) == 32 and stage.progress.updates == 16
+    stage.close()
+    summary = run.run()
+    assert summary["synergies"]["frames"] == 256 and summary["learn"]["frames_charged"] == 384
+    # Episodes of 25 steps: 12 actions twice, and one once.
+    evaluation = run.evaluator(run.learned())()
+    assert set(evaluation.lengths) == {25}
+
+
 def test_gaussian_divergence_trains_its_latent_dynamics():
     stage = explore_stage("explore.metric.divergence=gaussian")
     fill(stage)

@@ -22,6 +22,7 @@ from torchrl_etl.envs.wrappers import (
     FlatObservation,
     FullEpisodes,
     NamedObservation,
+    RepeatedAction,
     SeededVectorEnv,
 )
 
@@ -37,6 +38,7 @@ def make_env(
     device: torch.device | str | None = None,
     activations: bool = False,
     muscle_lengths: bool = False,
+    action_repeat: int = 1,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """Builds a task as a TorchRL environment.
@@ -65,6 +67,8 @@ def make_env(
             action (MyoSuite only). Defaults to ``False``.
         muscle_lengths (bool): adds ``muscle_length``, the lengths of muscles with their tendons in
             metres (MyoSuite only). Defaults to ``False``.
+        action_repeat (int): simulator steps for which every action is taken; their rewards add up,
+            and an episode's time limit still counts simulator steps. Defaults to 1.
         env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
             ``dm_control.suite.load``.
 
@@ -97,12 +101,15 @@ def make_env(
     """
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ValueError(f"num_envs must be a positive integer, got {num_envs!r}.")
+    if not isinstance(action_repeat, int) or action_repeat < 1:
+        raise ValueError(f"action_repeat must be a positive integer, got {action_repeat!r}.")
     task = resolve_task(name, goal)
     build = partial(
         _build,
         task,
         activations=activations,
         muscle_lengths=muscle_lengths,
+        action_repeat=action_repeat,
         env_kwargs=dict(env_kwargs or {}),
     )
     with quiet_compiler():
@@ -176,7 +183,12 @@ def _raw_actuator_names(simulation: Any) -> list[str]:
 
 
 def _build(
-    task: Task, *, activations: bool, muscle_lengths: bool, env_kwargs: dict[str, Any]
+    task: Task,
+    *,
+    activations: bool,
+    muscle_lengths: bool,
+    action_repeat: int,
+    env_kwargs: dict[str, Any],
 ) -> gym.Env:
     env, faults = _simulator(task, env_kwargs)
     if not isinstance(env.action_space, spaces.Box):
@@ -197,6 +209,8 @@ def _build(
     if not task.ends_early:
         env = FullEpisodes(env)
     env = FiniteGuard(env, task.name, faults)
+    if action_repeat > 1:
+        env = RepeatedAction(env, action_repeat)
     return NamedObservation(
         env, success_key, activations=activations, muscle_lengths=muscle_lengths
     )

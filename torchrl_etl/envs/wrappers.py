@@ -21,6 +21,7 @@ __all__ = [
     "FlatObservation",
     "FullEpisodes",
     "NamedObservation",
+    "RepeatedAction",
     "SeededVectorEnv",
     "SimulationError",
 ]
@@ -59,6 +60,26 @@ class FullEpisodes(gym.Wrapper):
     def step(self, action: np.ndarray):
         observation, reward, _, truncated, info = self.env.step(action)
         return observation, reward, False, truncated, info
+
+
+class RepeatedAction(gym.Wrapper):
+    """Takes every action for several steps, or until the episode ends, and adds up their rewards.
+
+    Observation, ``info`` and ends are those of the last of these steps.
+    """
+
+    def __init__(self, env: gym.Env, steps: int):
+        super().__init__(env)
+        self._steps = steps
+
+    def step(self, action: np.ndarray):
+        total = 0.0
+        for _ in range(self._steps):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += reward
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, info
 
 
 class FiniteGuard(gym.Wrapper):

@@ -82,6 +82,7 @@ _RULES: tuple[_Rule, ...] = (
         lambda v: _integer(v) and v > 0,
         (
             "num_synergies",
+            "action_repeat",
             "collector.num_envs",
             "collector.num_workers",
             "collector.frames_per_batch",
@@ -238,7 +239,7 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 # What the shapes of networks, or the meaning of their weights, depend on.
-_FIXED = ("env", "goal", "seed", "num_synergies", "synergies", "run_dir")
+_FIXED = ("env", "goal", "action_repeat", "seed", "num_synergies", "synergies", "run_dir")
 _FIXED += ("learn.residual", "learner", "experiment", "faithful")
 _FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
 _FIXED_SECTIONS = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -73,6 +74,7 @@ def evaluate(
     *,
     episodes: int,
     max_steps: int = 1000,
+    action_repeat: int = 1,
     seed: int = EVALUATION_SEED,
 ) -> Evaluation:
     """Run the deterministic policy for one episode per evaluation seed.
@@ -85,7 +87,9 @@ def evaluate(
 
     Keyword Args:
         episodes (int): number of episodes; episode i is seeded with ``seed + i``.
-        max_steps (int): where to cut an episode that the environment does not end.
+        max_steps (int): where to cut an episode that the environment does not end, in simulator
+            steps, as are the lengths.
+        action_repeat (int): simulator steps that a step of the environment takes.
         seed (int): first seed.
 
     Returns:
@@ -101,9 +105,9 @@ def evaluate(
         for episode in range(episodes):
             torch.manual_seed(seed + episode)
             env.set_seed(seed + episode)
-            rollout = env.rollout(max_steps, policy)
+            rollout = env.rollout(math.ceil(max_steps / action_repeat), policy)
             returns.append(rollout["next", "reward"].sum().item())
-            lengths.append(rollout.shape[-1])
+            lengths.append(min(max_steps, action_repeat * rollout.shape[-1]))
             if "solved" in rollout["next"].keys():
-                solved.append(rollout["next", "solved"].sum().item())
+                solved.append(action_repeat * rollout["next", "solved"].sum().item())
     return Evaluation(returns, lengths, solved or None, max_steps)

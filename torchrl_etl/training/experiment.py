@@ -64,7 +64,8 @@ class Experiment:
         self.device = torch.device(config.device)
         self.path = resume or Path(config.run_dir)
         self.task = resolve_task(config.env, config.goal)
-        self.make_env = partial(make_env, config.env, goal=config.goal, device=self.device)
+        task = {"goal": config.goal, "action_repeat": config.action_repeat}
+        self.make_env = partial(make_env, config.env, **task, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
         self.method = None  # ETL, whose stages are below
@@ -236,6 +237,7 @@ class Experiment:
             self.evaluation_env(stage),
             episodes=self.config.evaluation.episodes,
             max_steps=steps,
+            action_repeat=self.config.action_repeat,
         )
 
     def _learn(
@@ -293,6 +295,7 @@ class Experiment:
             self.config.env,
             goal=self.config.goal,
             num_envs=self.config.collector.num_envs,
+            action_repeat=self.config.action_repeat,
             **options,
         )
 
@@ -307,7 +310,11 @@ class Experiment:
         compile = self.config.compile
         if compile is None:  # what it takes to begin must pay
             compile = options["frames"] * options["updates_per_frame"] >= 10_000
-        own = {"compile": compile, "scratch": self.path / "buffer"}
+        own = {
+            "compile": compile,
+            "scratch": self.path / "buffer",
+            "action_repeat": self.config.action_repeat,
+        }
         return {"collector": collector, **own, **options}
 
     def loop_options(self) -> dict[str, Any]:

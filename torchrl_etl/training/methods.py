@@ -95,7 +95,10 @@ class DynSyn(Method):
             count = max(1, round(self.share * len(self.run.actuators)))
             seed = self.run.config.seed
             lengths = record_muscle_lengths(
-                self.run.make_env(), self.frames, amplitude=self.amplitude, seed=2**30 + seed
+                self.run.make_env(action_repeat=1),
+                self.frames,
+                amplitude=self.amplitude,
+                seed=2**30 + seed,
             )
             groups = group_muscles(lengths, count, seed=seed).tolist()
             write_atomically(self.file, json.dumps(groups))

@@ -77,6 +77,7 @@ class Stage(ABC):
         scratch (path): folder for these files, which are deleted when the stage is closed.
         batch_size (int): transitions in an update.
         collector (mapping): arguments of :func:`~torchrl_etl.collectors.make_batches`.
+        action_repeat (int): frames that a transition of the collector takes. Default: 1.
         updates_per_frame (float): updates per collected frame.
         learning_starts (int): frames before the first update.
         reward_scale (float): factor on the task's reward as the buffer keeps it.
@@ -105,12 +106,13 @@ class Stage(ABC):
         updates_per_frame: float,
         learning_starts: int,
         reward_scale: float,
+        action_repeat: int = 1,
         given: int = 0,
         compile: bool = False,
     ) -> None:
         self.policy, self.seed, self.device = policy, seed, device
         self.reward_scale = reward_scale
-        self.budget = frames
+        self.budget, self.action_repeat = frames, action_repeat
         self._make_batches = partial(
             make_batches, **collector, make_env=make_env, policy=policy, device=device
         )
@@ -118,13 +120,14 @@ class Stage(ABC):
         self.progress = Progress()
         self.buffer = TensorDictReplayBuffer(
             storage=make_storage(
-                min(buffer_size, given + frames + collector["frames_per_batch"]),
+                min(buffer_size, given + frames // action_repeat + collector["frames_per_batch"]),
                 device,
                 scratch / self.name if buffer_storage == "memmap" else None,
             ),
             batch_size=batch_size,
         )
-        self._most_updates = math.ceil(2 * updates_per_frame * collector["frames_per_batch"])
+        batch_frames = action_repeat * collector["frames_per_batch"]
+        self._most_updates = math.ceil(2 * updates_per_frame * batch_frames)
         self.batches: Batches | None = None
         self._gradients = compiled(self.gradients) if compile else self.gradients
         graphed = compile and device.type == "cuda"
@@ -176,10 +179,11 @@ class Stage(ABC):
         """Collect one batch into the buffer; returns the whole batch, flat."""
         batch = self.seen(self.batches.next().to(self.device)).reshape(-1)
         self.buffer.extend(self.transitions(batch))
-        self.progress.frames += batch.numel()
+        frames = self.action_repeat * batch.numel()
+        self.progress.frames += frames
         self.progress.episodes += int(batch["next", "done"].sum())
         if self.frames > self.learning_starts:
-            self.progress.owed += batch.numel() * self.updates_per_frame
+            self.progress.owed += frames * self.updates_per_frame
         return batch
 
     def learn(self) -> TensorDictBase | None:
