@@ -33,8 +33,9 @@ _PANELS = (
     ("solved", "success", "solved episodes [%]", 100.0),
 )
 
-# The last colour of the series is grey, which here belongs to the published curves.
-_COLORS = SERIES[:-1]
+# The last colour of the series is grey, which here belongs to the published curves; with black
+# instead there is one for each of seven methods.
+_COLORS = (*SERIES[:-1], "#000000")
 _LINES = ("-", "-.", (0, (5, 1.5, 1, 1.5, 1, 1.5)))
 _GREYS = ("0.35", "0.55", "0.7")
 # By name, so that one algorithm looks the same on every task and panel.
@@ -42,7 +43,7 @@ _PUBLISHED = ("FlashSAC", "SimbaV2", "XQC", "TD-MPC2", "MR.Q", "PPO")
 
 
 def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour, marker and line style for each method; distinct for up to eighteen.
+    """Colour, marker and line style for each method; distinct for up to twenty-one.
 
     Examples:
         >>> styles = looks(["sac", "etl"])

@@ -106,6 +106,8 @@ it ships, not measured here; no spread was published; their wrappers differ from
 (TD-MPC2 ignores termination).
     """
     differences = ["TD-MPC2 ignores termination"]
+    if env_id.startswith("myo"):
+        differences.insert(0, "SimbaV2 takes each action for two steps")
     if "KeyTurn" in env_id:
         differences.insert(0, "SimbaV2 cuts Key Turn at 100 steps")
     return (
