@@ -64,6 +64,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("explore.fit.actions=activation", "activation"),
         ("learn.critic.bins=51", "which needs a bound on returns"),
         ("learn.sac.noise=hold", "choose one of independent, held"),
+        ("learn.sac.num_critics=0", "num_critics is 0; it must be a whole number above 0"),
         ("learn.sac.hold.exponent=0", "learn.sac.hold.exponent is 0; it must be a number above 0"),
         ("learn.sac.hold.longest=x", "longest is 'x'; it must be a whole number above 0"),
         ("learn.sac.lr_end=2", "lr_end is 2; it must be a share in [0, 1]"),
@@ -127,7 +128,15 @@ def test_resuming_what_is_no_run_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "override", ["experiment=quick", "actor.hidden=[16]", "num_synergies=3", "env=myoHandPose"]
+    "override",
+    [
+        "experiment=quick",
+        "actor.hidden=[16]",
+        "num_synergies=3",
+        "env=myoHandPose",
+        "learn.sac.num_critics=1",
+        "action_repeat=2",
+    ],
 )
 def test_what_would_make_it_another_run_cannot_be_changed_on_resume(override, tmp_path):
     Experiment(tiny(f"run_dir='{tmp_path}/run'")).folder.open(resume=False)

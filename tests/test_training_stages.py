@@ -112,6 +112,17 @@ def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, o
         stage.close()
 
 
+@pytest.mark.parametrize("number", [1, 3])
+def test_there_are_as_many_critics_as_were_asked_for(number):
+    stage = learn_stage(None, f"learn.sac.num_critics={number}")
+    fill(stage)
+    assert {len(weight) for weight in stage.sac.qvalue_network_params.flatten_keys().values()} == {
+        number
+    }
+    assert stage.update()["loss_qvalue"].isfinite()
+    stage.close()
+
+
 def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(tmp_path):
     settings = ("learn.sac.unit_rows=true", "learner=residual", f"run_dir={tmp_path}")
     stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")

@@ -93,6 +93,7 @@ _RULES: tuple[_Rule, ...] = (
             "explore.encoder.embedding_dim",
             "learn.critic.bins",
             "learn.sac.hold.longest",
+            "learn.sac.num_critics",
             *_both("frames"),
         ),
     ),
@@ -240,7 +241,7 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
 
 # What the shapes of networks, or the meaning of their weights, depend on.
 _FIXED = ("env", "goal", "action_repeat", "seed", "num_synergies", "synergies", "run_dir")
-_FIXED += ("learn.residual", "learner", "experiment", "faithful")
+_FIXED += ("learn.sac.num_critics", "learn.residual", "learner", "experiment", "faithful")
 _FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
 _FIXED_SECTIONS = (
     "method",

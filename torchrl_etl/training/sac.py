@@ -96,6 +96,7 @@ class SACStage(Stage):
             action_spec=self.action_spec,
             target_entropy=self.target_entropy(sac["action_std"]),
             alpha_init=sac["alpha_init"],
+            num_qvalue_nets=sac["num_critics"],
             support=support(critic.get("bins", 1), bound),
         ).to(device)
         self.sac.set_keys(reward=self.reward)
