@@ -116,9 +116,8 @@ def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, o
 def test_there_are_as_many_critics_as_were_asked_for(number):
     stage = learn_stage(None, f"learn.sac.num_critics={number}")
     fill(stage)
-    assert {len(weight) for weight in stage.sac.qvalue_network_params.flatten_keys().values()} == {
-        number
-    }
+    weights = stage.sac.qvalue_network_params.flatten_keys().values()
+    assert {len(weight) for weight in weights} == {number}
     assert stage.update()["loss_qvalue"].isfinite()
     stage.close()
 
