@@ -83,6 +83,16 @@ def test_a_rival_compiles(method, tmp_path):
 
 
 @pytest.mark.slow
+def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
+    stage = Experiment(config("dep", tmp_path / "run", "action_repeat=2")).learn_stage(None)
+    stage.restart_collection()
+    actions = stage.collect().numel()
+    assert stage.frames == 2 * actions and stage.controller.frames == actions
+    stage.restart_collection()
+    assert stage.controller.frames == actions
+    stage.close()
+
+
 def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     experiment = Experiment(config("dynsyn", tmp_path / "run"))
     groups = experiment.run()["groups"]

@@ -174,6 +174,14 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
 
 
+def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
+    first, second = explore_stage("action_repeat=2"), learn_stage(None, "action_repeat=2")
+    first.collect()
+    second.take(first.explored(second.decoder))
+    assert second.progress.owed == 2 * 32 * second.updates_per_frame
+    first.close(), second.close()
+
+
 def test_coefficients_of_decoded_actions_are_found_again():
     torch.manual_seed(0)
     coefficients = 2 * torch.rand(512, 2) - 1

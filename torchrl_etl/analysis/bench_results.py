@@ -102,8 +102,11 @@ class BenchRun:
         return self.rows[-1].frames
 
     def at(self, frames: int) -> BenchRow | None:
-        """The last evaluation at or before ``frames``."""
-        return next((row for row in reversed(self.rows) if row.frames <= frames), None)
+        """The last evaluation up to 1 % past ``frames``.
+
+        A run ends with the batch that reaches its budget.
+        """
+        return next((row for row in reversed(self.rows) if row.frames <= 1.01 * frames), None)
 
     def curve(self, column: str) -> np.ndarray:
         """Frames and values of a column, [2, T], without the rows where it is missing."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rliable import library, metrics
 from scipy.stats import bootstrap
 
-from torchrl_etl.analysis.bench_results import BenchRow, BenchRun
+from torchrl_etl.analysis.bench_results import BenchRun
 from torchrl_etl.analysis.published import best_published, environment_id
 from torchrl_etl.analysis.statistics import Interval
 
@@ -39,8 +39,6 @@ __all__ = [
 # An evaluation so far below the budget, as a share of it, still stands for the budget: episodes
 # end at will, so evaluations fall on slightly different frames.
 _TOLERANCE = 0.05
-# And so far above it: a run ends with the batch that reaches its budget.
-_OVERSHOOT = 0.01
 
 
 def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
@@ -206,11 +204,9 @@ def compare(
     if len({run.setting for run in runs}) != 1:
         raise ValueError("Compare the finished runs of one task and goal; pass no others.")
     budget = common_budget(runs) if frames is None else frames
-    fair = [
-        run for run in runs if run.last_frames >= (1 - _TOLERANCE) * budget and _at(run, budget)
-    ]
+    fair = [run for run in runs if run.last_frames >= (1 - _TOLERANCE) * budget and run.at(budget)]
     by_method = {name: [run for run in fair if run.method == name] for name in methods}
-    baseline = [_at(run, budget).mean_return for run in by_method.get(control, ())]
+    baseline = [run.at(budget).mean_return for run in by_method.get(control, ())]
     first = min(run.rows[0].frames for run in runs)
     untrained = [run.rows[0].mean_return for run in runs if run.rows[0].frames == first]
     return Comparison(
@@ -333,7 +329,7 @@ def _result(
     is_control: bool,
     repetitions: int,
 ) -> MethodResult:
-    rows = [_at(run, budget) for run in runs]
+    rows = [run.at(budget) for run in runs]
     columns = ("frames", "mean_return", "solved", "solved_time", "wall_seconds")
     frames, returns, *others = (
         np.array([getattr(row, name) for row in rows], float) for name in columns
@@ -346,12 +342,8 @@ def _result(
     return MethodResult(method, seeds, frames, returns, *others, interval, improvement)
 
 
-def _at(run: BenchRun, budget: int) -> BenchRow | None:
-    return run.at(int((1 + _OVERSHOOT) * budget))
-
-
 def _stale(run: BenchRun, budget: int) -> bool:
-    row = _at(run, budget)
+    row = run.at(budget)
     return row is None or row.frames < (1 - _TOLERANCE) * budget
 
 

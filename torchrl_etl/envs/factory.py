@@ -99,10 +99,9 @@ def make_env(
         >>> rollout["next", "solved"].shape, rollout["next", "solved"].dtype
         (torch.Size([2, 3, 1]), torch.bool)
     """
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise ValueError(f"num_envs must be a positive integer, got {num_envs!r}.")
-    if not isinstance(action_repeat, int) or action_repeat < 1:
-        raise ValueError(f"action_repeat must be a positive integer, got {action_repeat!r}.")
+    for argument, value in {"num_envs": num_envs, "action_repeat": action_repeat}.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{argument} must be a positive integer, got {value!r}.")
     task = resolve_task(name, goal)
     build = partial(
         _build,

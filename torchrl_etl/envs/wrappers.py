@@ -65,7 +65,8 @@ class FullEpisodes(gym.Wrapper):
 class RepeatedAction(gym.Wrapper):
     """Takes every action for several steps, or until the episode ends, and adds up their rewards.
 
-    Observation, ``info`` and ends are those of the last of these steps.
+    Observation, ``info`` and ends are those of the last of these steps. ``frame_skip`` of TorchRL's
+    ``GymWrapper`` does the same for one simulator, but stops a whole batch where one of it ends.
     """
 
     def __init__(self, env: gym.Env, steps: int):

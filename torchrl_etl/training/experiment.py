@@ -64,8 +64,8 @@ class Experiment:
         self.device = torch.device(config.device)
         self.path = resume or Path(config.run_dir)
         self.task = resolve_task(config.env, config.goal)
-        task = {"goal": config.goal, "action_repeat": config.action_repeat}
-        self.make_env = partial(make_env, config.env, **task, device=self.device)
+        self._variant = {"goal": config.goal, "action_repeat": config.action_repeat}
+        self.make_env = partial(make_env, config.env, **self._variant, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
         self.method = None  # ETL, whose stages are below
@@ -293,9 +293,8 @@ class Experiment:
         return partial(
             _env_of_a_collector,
             self.config.env,
-            goal=self.config.goal,
             num_envs=self.config.collector.num_envs,
-            action_repeat=self.config.action_repeat,
+            **self._variant,
             **options,
         )
 
@@ -310,12 +309,13 @@ class Experiment:
         compile = self.config.compile
         if compile is None:  # what it takes to begin must pay
             compile = options["frames"] * options["updates_per_frame"] >= 10_000
-        own = {
+        return {
+            "collector": collector,
+            "action_repeat": self.config.action_repeat,
             "compile": compile,
             "scratch": self.path / "buffer",
-            "action_repeat": self.config.action_repeat,
+            **options,
         }
-        return {"collector": collector, **own, **options}
 
     def loop_options(self) -> dict[str, Any]:
         return {

@@ -99,7 +99,7 @@ class LearnStage(SACStage):
         if self.norm is not None:
             self.norm.see(rows["observation"])
         self.buffer.extend(self.transitions(rows))
-        self.progress.owed += len(rows) * self.updates_per_frame
+        self.earn(len(rows))
 
     def acting(self) -> dict[str, Any]:
         return {**super().acting(), "decoder": self.decoder}

@@ -95,7 +95,7 @@ class DynSyn(Method):
             count = max(1, round(self.share * len(self.run.actuators)))
             seed = self.run.config.seed
             lengths = record_muscle_lengths(
-                self.run.make_env(action_repeat=1),
+                self.run.make_env(action_repeat=1),  # a recorded step is a frame
                 self.frames,
                 amplitude=self.amplitude,
                 seed=2**30 + seed,

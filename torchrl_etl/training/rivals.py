@@ -75,7 +75,8 @@ class DEPStage(SACStage):
         return TensorDictSequential(super().exploring(noise), self.controller)
 
     def restart_collection(self) -> None:
-        self.controller.frames = self.frames  # a resumed run goes on where it was
+        # A resumed run goes on where it was; the controller counts its actions.
+        self.controller.frames = self.frames // self.action_repeat
         super().restart_collection()
 
 

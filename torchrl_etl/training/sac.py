@@ -49,8 +49,9 @@ class SACStage(Stage):
             ("independent" at every step or "held" for several), ``hold`` (keyword arguments of
             :class:`~torchrl_etl.modules.HeldNoise`), ``normalize_observations`` (actor and
             critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
-            ``unit_rows`` (the rows of all their linear layers keep unit length) and ``lr_end``
-            (share of every learning rate that is left at the last frame; they fall linearly).
+            ``unit_rows`` (the rows of all their linear layers keep unit length), ``num_critics``
+            (the smallest of whose values counts) and ``lr_end`` (share of every learning rate that
+            is left at the last frame; they fall linearly).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:

@@ -112,7 +112,8 @@ class Stage(ABC):
     ) -> None:
         self.policy, self.seed, self.device = policy, seed, device
         self.reward_scale = reward_scale
-        self.budget, self.action_repeat = frames, action_repeat
+        self.budget = frames
+        self.action_repeat = action_repeat
         self._make_batches = partial(
             make_batches, **collector, make_env=make_env, policy=policy, device=device
         )
@@ -179,12 +180,15 @@ class Stage(ABC):
         """Collect one batch into the buffer; returns the whole batch, flat."""
         batch = self.seen(self.batches.next().to(self.device)).reshape(-1)
         self.buffer.extend(self.transitions(batch))
-        frames = self.action_repeat * batch.numel()
-        self.progress.frames += frames
+        self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
         if self.frames > self.learning_starts:
-            self.progress.owed += frames * self.updates_per_frame
+            self.earn(batch.numel())
         return batch
+
+    def earn(self, transitions: int) -> None:
+        """Owe the updates that the frames of so many transitions are worth."""
+        self.progress.owed += self.action_repeat * transitions * self.updates_per_frame
 
     def learn(self) -> TensorDictBase | None:
         """The updates that the collected frames have earned; returns their mean scalars."""

@@ -1,0 +1,127 @@
+"""A bench's report says what its rows say, in tables and pictures."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.bench_rows import FEW, bench, run, write
+from torchrl_etl.analysis.bench_pictures import _PUBLISHED, looks, overall_picture, task_picture
+from torchrl_etl.analysis.published import caveats, published_curves
+
+
+def report(*arguments):
+    path = Path(__file__).parent.parent / "recipes" / "report.py"
+    spec = importlib.util.spec_from_file_location("report", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.main([*arguments, f"repetitions={FEW}"])
+
+
+def test_looks_are_distinct_and_never_the_published_grey():
+    styles = looks([f"method {i}" for i in range(21)])
+    assert len({(s["color"], s["linestyle"]) for s in styles.values()}) == 21
+    assert "#666666" not in {style["color"] for style in styles.values()}
+
+
+def test_every_published_algorithm_has_a_look():
+    shown = [published_curves("dog-run"), published_curves("myoHandPoseFixed-v0", "success")]
+    assert {curve.algorithm for curves in shown for curve in curves} == set(_PUBLISHED)
+
+
+def test_a_published_failure_does_not_flatten_the_curves(tmp_path, monkeypatch):
+    """FlashSAC's Pen Twirl is published at −4,833 after 100,000 frames."""
+    figures = []
+    monkeypatch.setattr(
+        "torchrl_etl.analysis.bench_pictures.write", lambda figure, path: figures.append(figure)
+    )
+    runs = bench(tmp_path, run([0.0, 100.0, 200.0], task="myoHandPenTwirl")).runs
+    task_picture(runs, looks(["sac"]), tmp_path / "x.png")
+    assert figures[0].axes[0].get_ylim()[0] > -1000
+    caption = " ".join(figures[0].get_supxlabel().split())
+    assert "Below the axis: FlashSAC at 100,000 frames (-4,833)" in caption
+    assert caveats("myoHandPenTwirlFixed-v0") in caption
+
+
+def test_pictures_refuse_nothing_to_draw(tmp_path):
+    with pytest.raises(ValueError, match="no finished runs"):
+        task_picture([], {}, tmp_path / "x.png")
+    with pytest.raises(ValueError, match="No method"):
+        overall_picture([], {}, tmp_path / "x.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_report_from_end_to_end(tmp_path, capsys):
+    rows = []
+    for seed in range(3):
+        rows += run([-300, 100 + seed, 500 + seed], seed=seed, solved=0.5, solved_time=0.25)
+        rows += run([-300, 200 + seed, 600 + seed], seed=seed, method="etl", commit="fff0000")
+        rows += run([1, 5, 20 + seed], seed=seed, task="dog-run")
+    rows += run([-300, 0, 7777], seed=9, method="etl", status="killed: out of memory")
+    rows += run([1, 5, 44], seed=0, task="dog-run", method="dep", machine="other | class")
+    rows += run([1, 2], seed=0, task="dog-walk", method="eme", status="diverged")
+    rows += run([1, 5, 21], seed=1, task="dog-run")  # a repeat
+    folder, out = write(tmp_path / "a bench", rows), tmp_path / "new" / "report"
+    report(f"results={folder}", f"out={out}")
+    assert "written to" in capsys.readouterr().out
+    text = (out / "report.md").read_text()
+    for words in (
+        "At 100,000 environment frames, exploration included.",
+        "| etl | 3 | 601.0 | 600.0 to 602.0 | 601.0 |",
+        "| dep | 1 | 44.0 | - | 44.0 | one seed: no interval | 1.00 |",
+        "| sac | 3 | 501.0 | 500.0 to 502.0 | 501.0 |",
+        "50 % | 25 % | 1.00 |",
+        "3 evaluations belong to runs that were repeated later",
+        "No run finished of eme.",
+        "etl lacks dog-run (fixed)",
+        "dep lacks myoHandPose (fixed)",
+        "Without a finished run that reached the budget: etl.",
+        "unequal numbers of seeds",
+        "- myoHandPose (fixed), etl, seed 9: killed: out of memory, last evaluated at 100,000",
+        "- dog-walk (fixed), eme, seed 0: diverged, last evaluated at 50,000 frames",
+        "| fff0000 | 3 |",
+        "| other \\| class | 1 |",
+        "| torch | 2.13.0 | 10 |",
+        "FlashSAC, published",
+        "TD-MPC2 ignores termination",
+        f"'results={folder}'",
+    ):
+        assert words in text, words
+    assert "7,777" not in text
+    for name in ("overall", "myoHandPose-fixed", "dog-run-fixed"):
+        assert f"({name}.png)" in text
+        with Image.open(out / f"{name}.png") as image:
+            assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["results={}", "control=sca"], 2, "control=sca has no finished run; did you mean sac?"),
+        (["results={}", "control=zzz"], 2, "there are sac."),
+        (["results={}", "frames=-5"], 2, "frames is '-5'; it must be a whole number from 1 up"),
+        (["results={}/nowhere"], 2, "There is no folder"),
+        ([], 2, "no results are named"),
+        (["result={}"], "did you mean results?", ""),
+        (["{}"], "not of the form key=value", ""),
+    ],
+)
+def test_a_wrong_command_gets_one_sentence(tmp_path, capsys, arguments, code, words):
+    folder = write(tmp_path / "bench", run([0, 1]))
+    with pytest.raises(SystemExit) as exit_:
+        report(*(argument.format(folder) for argument in arguments))
+    if isinstance(code, int):
+        message = capsys.readouterr().err
+        assert exit_.value.code == code and words in message and message.count("\n") == 1
+    else:
+        assert code in exit_.value.code
+
+
+def test_nothing_finished_is_said(tmp_path, capsys):
+    folder = write(tmp_path / "bench", run([0, 1], status="running"))
+    with pytest.raises(SystemExit):
+        report(f"results={folder}")
+    assert "None of the 1 runs finished" in capsys.readouterr().err

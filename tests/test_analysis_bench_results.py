@@ -1,0 +1,71 @@
+"""What a bench's file says is read row by row, and what it cannot say is named."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.bench_rows import bench, row, run, write
+from torchrl_etl.analysis.bench_results import COLUMNS, read_bench
+
+
+def test_newest_row_wins_and_takes_the_older_attempts_tail_along(tmp_path):
+    results = bench(tmp_path, run([0, 1, 2, 3]), run([10, 11, 12]))
+    assert [one.mean_return for one in results.runs[0].rows] == [10, 11, 12]
+    assert results.replaced == 4 and results.row_count == 7
+
+
+def test_a_run_is_as_finished_as_its_newest_row(tmp_path):
+    broken = run([0, 1], seed=1, status="diverged")
+    broken[-1]["return"] = "nan"
+    going = run([0, 1], seed=2, status="running")
+    going[-1]["status"] = "finished"
+    results = bench(tmp_path, run([0, 1]), broken, going)
+    assert [one.seed for one in results.finished] == [0, 2]
+    assert [str(one) for one in results.unfinished] == ["myoHandPose (fixed), sac, seed 1"]
+
+
+def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
+    tasks = ("aFarTask", "dog-run", "myoHandPose")
+    results = bench(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))
+    assert [task for task, _ in results.settings] == ["myoHandPose", "dog-run", "aFarTask"]
+    assert {goal for _, goal in results.settings} == {"fixed"}
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        ({"return": "12,5"}, "line 3: return is '12,5', which is not a number"),
+        ({"return": ""}, "line 3: .* is finished but this evaluation has no finite return"),
+        ({"frames": "1.5"}, "line 3: frames is '1.5'; it must be a whole number"),
+        ({"seed": ""}, "line 3: seed is ''"),
+        ({"solved": "80"}, "line 3: solved is 80; it must be a share"),
+        ({"method": " "}, "line 3: method is empty"),
+        ({"versions": "{torch"}, "line 3: versions is not a JSON text"),
+        ({"versions": "[1]"}, "line 3: versions must be a JSON object"),
+    ],
+)
+def test_a_bad_cell_is_named_with_its_line(tmp_path, cells, words):
+    folder = write(tmp_path, [row(), row(frames=1) | cells])
+    with pytest.raises(ValueError, match=words):
+        read_bench(folder)
+
+
+def test_missing_things_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="There is no folder"):
+        read_bench(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=r"has no results\.csv"):
+        read_bench(tmp_path)
+    with pytest.raises(ValueError, match="lacks the columns seed, solved_time;"):
+        read_bench(
+            write(tmp_path, [row()], [c for c in COLUMNS if c not in ("seed", "solved_time")])
+        )
+    with pytest.raises(ValueError, match="no rows"):
+        read_bench(write(tmp_path, []))
+    (tmp_path / "results.csv").write_text("")
+    with pytest.raises(ValueError, match="no rows"):
+        read_bench(tmp_path)
+    folder = write(tmp_path, [row()])
+    with (folder / "results.csv").open("a") as file:
+        file.write("myoHandPose,fixed,sac,0,1000")
+    with pytest.raises(ValueError, match="line 3: the number of cells"):
+        read_bench(folder)
