@@ -28,6 +28,7 @@ REMEMBERS = (
     "learn.sac.normalize_observations=true",
     "learn.sac.return_bound=5",
     "learn.sac.lr_end=0.5",
+    "learn.sac.actor_average=0.9",
 )
 
 

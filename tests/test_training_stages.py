@@ -138,6 +138,36 @@ def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(
     stage.close()
 
 
+def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns():
+    stage = learn_stage(None, "learn.sac.actor_average=0.75")
+    fill(stage)
+    averaged = list(stage.trained_policy.parameters())
+    expected = None
+    for _ in range(3):
+        stage.update()
+        actor = [weight.detach().clone() for weight in stage.actor.parameters()]
+        expected = expected or actor  # the first is the average of itself
+        expected = [0.75 * old + 0.25 * new for old, new in zip(expected, actor, strict=True)]
+        torch.testing.assert_close(averaged, expected)
+    assert {id(weight) for weight in stage.policy.parameters()} >= set(
+        map(id, stage.actor.parameters())
+    )
+    assert not {id(weight) for weight in stage.policy.parameters()} & set(map(id, averaged))
+    stage.close()
+
+
+def test_an_average_that_keeps_nothing_is_the_actor():
+    stage = learn_stage(None, "learn.sac.actor_average=0")
+    fill(stage)
+    stage.update()
+    stage.update()
+    for averaged, weight in zip(
+        stage.trained_policy.parameters(), stage.actor.parameters(), strict=True
+    ):
+        assert torch.equal(averaged, weight)
+    stage.close()
+
+
 def test_learning_rates_fall_in_a_line_with_the_frames():
     stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
     initial = [group["lr"] for group in stage.optimizer.param_groups]

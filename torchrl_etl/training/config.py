@@ -158,7 +158,12 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a share in [0, 1)",
         lambda v: _real(v) and 0 <= v < 1,
-        ("explore.bonus.decay", "explore.metric.gamma", *_both("sac.gamma")),
+        (
+            "explore.bonus.decay",
+            "explore.metric.gamma",
+            "learn.sac.actor_average",
+            *_both("sac.gamma"),
+        ),
     ),
     (
         "a list of whole numbers above 0",

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
@@ -50,8 +51,10 @@ class SACStage(Stage):
             :class:`~torchrl_etl.modules.HeldNoise`), ``normalize_observations`` (actor and
             critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
             ``unit_rows`` (the rows of all their linear layers keep unit length), ``num_critics``
-            (the smallest of whose values counts) and ``lr_end`` (share of every learning rate that
-            is left at the last frame; they fall linearly).
+            (the smallest of whose values counts), ``lr_end`` (share of every learning rate that
+            is left at the last frame; they fall linearly) and ``actor_average`` (the trained policy
+            is an exponential average of the actor, of which this share stays at every update; the
+            actor itself collects and learns).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:
@@ -85,7 +88,9 @@ class SACStage(Stage):
         self.action_spec, out_key = self.emitted(muscles)
         self.actor = self.build_actor(inputs, self.action_spec, out_key=out_key, **actor).to(device)
         value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
-        self.trained_policy = self.from_raw(self.actor)
+        keeps = get_ema_multi_avg_fn(sac["actor_average"])
+        self.average = AveragedModel(self.actor, multi_avg_fn=keeps)
+        self.trained_policy = self.from_raw(self.average.module)
         policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
         super().__init__(make_env, policy, device=device, **stage)
         bound = sac["return_bound"]
@@ -157,6 +162,11 @@ class SACStage(Stage):
             self.schedule.step()
         return logs
 
+    def update(self) -> TensorDictBase:
+        scalars = super().update()
+        self.average.update_parameters(self.actor)  # asks its counter: no part of a CUDA graph
+        return scalars
+
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = batch.select(*self.kept, ("next", "observation"))
         kept["next"].update(batch["next"].select("done", "terminated"))
@@ -189,7 +199,8 @@ class SACStage(Stage):
         return {"actor": self.trained_policy}
 
     def parts(self) -> dict[str, Any]:
-        parts = {"sac": self.sac, "optimizer": self.optimizer, **self.acting()}
+        parts = {"sac": self.sac, "average": self.average, "optimizer": self.optimizer}
+        parts |= self.acting()
         return parts if self.return_scale is None else parts | {"return_scale": self.return_scale}
 
     # What rewards and observations are scaled by -----------------------------------------------
