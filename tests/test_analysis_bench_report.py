@@ -74,7 +74,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
         "| dep | 1 | 44.0 | - | 44.0 | one seed: no interval | 1.00 |",
         "| sac | 3 | 501.0 | 500.0 to 502.0 | 501.0 |",
         "50 % | 25 % | 1.00 |",
-        "3 evaluations belong to runs that were repeated later",
+        "Evaluations of runs that were repeated later do not count (3)",
         "No run finished of eme.",
         "etl lacks dog-run (fixed)",
         "dep lacks myoHandPose (fixed)",

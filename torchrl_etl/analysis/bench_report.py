@@ -119,8 +119,8 @@ def _header(bench: BenchResults, arguments: Sequence[str], control: str) -> list
     )
     if bench.replaced:
         counts += (
-            f" {bench.replaced} evaluations belong to runs that were repeated later: the newest "
-            "row of a run counts."
+            f" Evaluations of runs that were repeated later do not count ({bench.replaced}): the "
+            "newest row of a run does."
         )
     never = sorted({run.method for run in bench.unfinished} - {r.method for r in bench.finished})
     if never:
