@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> None:
             frames=frames,
             repetitions=repetitions,
         )
-    print(f"{tasks} tasks, {methods} methods, {len(bench.finished)} finished runs")
+    print(f"tasks: {tasks}, methods: {methods}, finished runs: {len(bench.finished)}")
     print(f"  written to {folder / 'report.md'}")
 
 
