@@ -1,0 +1,36 @@
+"""Tiny stages, ready to collect, and whether they changed."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from tests.configs import tiny
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.training import Experiment
+
+
+def explore_stage(*overrides):
+    stage = Experiment(tiny("run_dir=unused", *overrides)).explore_stage()
+    stage.restart_collection()
+    return stage
+
+
+def learn_stage(decoder=None, *overrides):
+    decoder = decoder or SynergyDecoder(2, 16, hidden=(32, 32))
+    stage = Experiment(tiny("run_dir=unused", *overrides)).learn_stage(decoder)
+    stage.restart_collection()
+    return stage
+
+
+def fill(stage, batches: int = 6) -> None:
+    for _ in range(batches):
+        stage.collect()
+
+
+def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
+    return {key: value.clone() for key, value in module.state_dict().items()}
+
+
+def changed(module: nn.Module, before: dict[str, torch.Tensor]) -> bool:
+    return any(not torch.equal(value, before[key]) for key, value in module.state_dict().items())

@@ -1,0 +1,153 @@
+"""What the learner of stage 2 and of its rivals can be asked for, the control included."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from tests.configs import tiny
+from tests.stages import changed, fill, learn_stage, snapshot
+from torchrl_etl.training import Experiment
+
+
+def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
+    settings = ("method=sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
+    stage = Experiment(tiny("run_dir=unused", *settings)).learn_stage(None)
+    stage.restart_collection()
+    fill(stage)
+    seen = {}
+    stage.sac.register_forward_pre_hook(
+        lambda _, args: seen.update(reward=args[0]["next", "reward"])
+    )
+    torch.manual_seed(0)
+    kept = stage.buffer.sample()["next", "reward"]
+    torch.manual_seed(0)
+    before = snapshot(stage.policy)
+    stage.update()
+    scale = stage.return_scale.scale.float()
+    assert scale != 1 and torch.allclose(seen["reward"], kept / scale)
+    assert changed(stage.policy, before)
+    assert stage.policy.out_keys[-1] == "action" and stage.action_spec.shape == (16,)
+    stage.close()
+
+
+@pytest.mark.parametrize("method", ["sac", "etl", "lattice", "dynsyn", "eme", "sar"])
+def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp_path):
+    settings = (f"method={method}", "learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
+    experiment = Experiment(tiny(*settings))
+    blank = experiment.blank_decoder() if method == "etl" else None
+    stage = experiment.learn_stage(blank)
+    stage.restart_collection()
+    fill(stage)
+    seen = {}
+    stage.sac.register_forward_pre_hook(lambda _, args: seen.update(args[0].flatten_keys(".")))
+    statistics = snapshot(stage.norm)
+    stage.update()
+    assert not changed(stage.norm, statistics), "sampling a batch is not seeing new observations"
+    raw = stage.buffer.storage[:]["observation"].double()
+    mean, std = raw.mean(0), raw.std(0, correction=0)
+    for prefix in ("", "next."):
+        expected = ((seen[f"{prefix}observation"] - mean) / std).clamp(-10, 10).float()
+        torch.testing.assert_close(seen[f"{prefix}normalized_observation"], expected)
+    # What acts, in training and in evaluation, reads raw observations and scales them alike.
+    observation = {"observation": raw[:5].float()}
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acted = stage.trained_policy(TensorDict(observation, [5]))
+    torch.testing.assert_close(acted["normalized_observation"], stage.norm(raw[:5].float()))
+    assert "observation" not in stage.actor.in_keys
+    stage.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("engine", "oldest"), [("single", 1), ("process", 1), ("distributed", 2)])
+def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
+    # A worker on another machine is asked for a batch before the last one is learned from.
+    settings = ("method=sac", f"collector={engine}", "collector.ahead=false")
+    settings += () if engine == "single" else ("collector.num_workers=1",)
+    settings += ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
+    stage = Experiment(tiny(*settings)).learn_stage(None)
+    try:
+        stage.restart_collection()
+        known = []
+        for _ in range(6):
+            stage.collect()
+            known.append(copy.deepcopy(stage.norm))
+        batch = stage.batches.next()
+        acted = batch["normalized_observation"]
+        assert any(torch.allclose(acted, norm(batch["observation"])) for norm in known[-oldest:])
+    finally:
+        stage.close()
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_there_are_as_many_critics_as_were_asked_for(number):
+    stage = learn_stage(None, f"learn.sac.num_critics={number}")
+    fill(stage)
+    weights = stage.sac.qvalue_network_params.flatten_keys().values()
+    assert {len(weight) for weight in weights} == {number}
+    assert stage.update()["loss_qvalue"].isfinite()
+    stage.close()
+
+
+def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(tmp_path):
+    settings = ("learn.sac.unit_rows=true", "learner=residual", f"run_dir={tmp_path}")
+    stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
+    fill(stage)
+    stage.update()
+    linear = [m.weight for m in stage.actor.modules() if isinstance(m, nn.Linear)]
+    critics = stage.sac.qvalue_network_params
+    stacked = [p for p in critics.parameters() if p.ndim == 3]
+    assert len(linear) == len(stacked) == 6  # in, two in each of two blocks, out
+    for weight in (*linear, *stacked):
+        torch.testing.assert_close(weight.norm(dim=-1), torch.ones(weight.shape[:-1]))
+    norms = [m.weight for m in stage.actor.modules() if isinstance(m, nn.LayerNorm)]
+    assert all(abs(norm.norm() - 4.0) < 0.1 for norm in norms)  # √16: as they started
+    stage.close()
+
+
+def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns():
+    stage = learn_stage(None, "learn.sac.actor_average=0.75")
+    fill(stage)
+    averaged = list(stage.trained_policy.parameters())
+    expected = None
+    for _ in range(3):
+        stage.update()
+        actor = [weight.detach().clone() for weight in stage.actor.parameters()]
+        expected = expected or actor  # the first is the average of itself
+        expected = [0.75 * old + 0.25 * new for old, new in zip(expected, actor, strict=True)]
+        torch.testing.assert_close(averaged, expected)
+    assert {id(weight) for weight in stage.policy.parameters()} >= set(
+        map(id, stage.actor.parameters())
+    )
+    assert not {id(weight) for weight in stage.policy.parameters()} & set(map(id, averaged))
+    stage.close()
+
+
+def test_an_average_that_keeps_nothing_is_the_actor():
+    stage = learn_stage(None, "learn.sac.actor_average=0")
+    fill(stage)
+    stage.update()
+    stage.update()
+    for averaged, weight in zip(
+        stage.trained_policy.parameters(), stage.actor.parameters(), strict=True
+    ):
+        assert torch.equal(averaged, weight)
+    stage.close()
+
+
+def test_learning_rates_fall_in_a_line_with_the_frames():
+    stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
+    initial = [group["lr"] for group in stage.optimizer.param_groups]
+    while not stage.finished:
+        stage.collect()
+        stage.learn()
+        share = 1 - 0.5 * stage.frames / 640 if stage.progress.updates else 1.0
+        rates = [group["lr"] for group in stage.optimizer.param_groups]
+        assert rates == pytest.approx([share * lr for lr in initial])
+    assert share == pytest.approx(0.5)
+    stage.close()
