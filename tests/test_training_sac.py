@@ -111,15 +111,15 @@ def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(
 
 
 def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns():
-    stage = learn_stage(None, "learn.sac.actor_average=0.75")
+    stage = learn_stage(None, "learn.sac.actor_average=0.25")
     fill(stage)
     averaged = list(stage.trained_policy.parameters())
     expected = None
-    for _ in range(3):
+    for kept in (0, 2 / 11, 3 / 12, 0.25, 0.25):  # (1 + n) / (10 + n), then the share
         stage.update()
         actor = [weight.detach().clone() for weight in stage.actor.parameters()]
-        expected = expected or actor  # the first is the average of itself
-        expected = [0.75 * old + 0.25 * new for old, new in zip(expected, actor, strict=True)]
+        expected = expected or actor
+        expected = [torch.lerp(new, old, kept) for old, new in zip(expected, actor, strict=True)]
         torch.testing.assert_close(averaged, expected)
     assert {id(weight) for weight in stage.policy.parameters()} >= set(
         map(id, stage.actor.parameters())
