@@ -124,6 +124,23 @@ def test_runs_that_end_before_an_asked_budget_are_left_out(tmp_path):
     assert [one.method for one in comparison.short] == ["etl"]
 
 
+def test_frames_to_the_controls_return_are_those_of_the_mean_over_seeds(tmp_path):
+    frames = [0, 10, 20, 30]
+    results = bench(
+        tmp_path,
+        run([0, 1, 5, 4], frames, seed=0),
+        run([0, 1, 3, 2], frames, seed=1),  # sac ends at a mean of 3
+        run([0, 9, 0, 3], frames, method="etl", seed=0),
+        run([0, -5, 6, 0], frames, method="etl", seed=1),  # means of 2, 3 and 1.5
+        run([2, 2, 2, 2], frames, method="sar"),
+    )
+    compared = compare(results.finished, ["sac", "etl", "sar"], "sac", repetitions=FEW)
+    reached = {result.method: result.frames_to_control for result in compared.results}
+    assert reached == {"sac": 20, "etl": 20, "sar": None}
+    alone = compare(results.finished, ["etl"], "sac", repetitions=FEW)
+    assert alone.result("etl").frames_to_control is None
+
+
 def test_unequal_seeds_and_missing_tasks(tmp_path):
     """By hand. Hand Pose at 100,000: zero −100, one 683.46 (FlashSAC). Leg Walk: one is SAC's."""
     pose = [run([-100, 0, 683.46], method="sac", seed=s) for s in (0, 1, 2)]

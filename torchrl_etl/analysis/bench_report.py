@@ -35,6 +35,7 @@ ends with a whole batch; nothing is interpolated. `mean` and the range are over 
 the interquartile mean (of three seeds or fewer: the mean) with the percentile bootstrap's 95 % \
 interval, seeds resampled within each task (rliable); of two seeds it is their range. \
 `P(> {control})` is the probability that a run beats a run of {control}, a tie counting one half. \
+`frames to {control}'s`: where the mean over seeds first is what {control} has at the end. \
 One seed says nothing about spread and gets no interval. `solved` is the share of episodes, \
 `solved time` the share of steps."""
 
@@ -183,6 +184,7 @@ def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[
     parts = [f"At {comparison.budget:,} environment frames, exploration included."]
     solved = any(np.isfinite(result.solved).any() for result in comparison.results)
     header = ["method", "seeds", "mean", "min to max", "IQM", "95 %", f"P(> {control})"]
+    header.append(f"frames to {control}'s")
     header += ["solved", "solved time"] * solved + ["wall time [h]"]
     if comparison.results:
         parts.append(_table(header, [_method_row(result, solved) for result in comparison.results]))
@@ -217,6 +219,7 @@ def _method_row(result: MethodResult, solved: bool) -> tuple[str, ...]:
         "-" if one else f"{_plain(returns.min())} to {_plain(returns.max())}",
         *_interval(result.iqm, _plain),
         "-" if result.improvement is None else f"{result.improvement:.2f}",
+        "-" if result.frames_to_control is None else f"{result.frames_to_control:,}",
         *((_percent(result.solved), _percent(result.solved_time)) if solved else ()),
         _mean(result.wall_seconds / 3600, "{:.2f}"),
     )

@@ -122,7 +122,11 @@ def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarra
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method on one task at the budget; arrays have one number per run, in order of seeds."""
+    """One method on one task at the budget; arrays have one number per run, in order of seeds.
+
+    ``frames_to_control`` are those at which the mean over its seeds is for the first time what the
+    control's is at the budget; ``None`` if it never is, or if there is no control.
+    """
 
     method: str
     seeds: tuple[int, ...]
@@ -133,6 +137,7 @@ class MethodResult:
     wall_seconds: np.ndarray
     iqm: Interval
     improvement: float | None
+    frames_to_control: int | None
 
 
 @dataclass(frozen=True)
@@ -339,7 +344,18 @@ def _result(
         improvement = probability_of_improvement([(returns, baseline)], repetitions=0).mean
     seeds = tuple(run.seed for run in runs)
     interval = iqm([returns], repetitions=repetitions)
-    return MethodResult(method, seeds, frames, returns, *others, interval, improvement)
+    reached = _first_at(runs, float(np.mean(baseline)), budget) if baseline else None
+    return MethodResult(method, seeds, frames, returns, *others, interval, improvement, reached)
+
+
+def _first_at(runs: Sequence[BenchRun], target: float, budget: int) -> int | None:
+    """The first evaluation within the budget at which the mean over runs is at the target."""
+    evaluated = sorted({row.frames for run in runs for row in run.rows})
+    begun = max(run.rows[0].frames for run in runs)
+    for frames in (f for f in evaluated if begun <= f <= 1.01 * budget):
+        if np.mean([run.at(frames).mean_return for run in runs]) >= target:
+            return frames
+    return None
 
 
 def _stale(run: BenchRun, budget: int) -> bool:
