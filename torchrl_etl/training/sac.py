@@ -53,8 +53,8 @@ class SACStage(Stage):
             ``unit_rows`` (the rows of all their linear layers keep unit length), ``num_critics``
             (the smallest of whose values counts), ``lr_end`` (share of every learning rate that
             is left at the last frame; they fall linearly) and ``actor_average`` (the trained policy
-            is an exponential average of the actor, see :func:`average_of_late`; the actor itself
-            collects and learns).
+            is an exponential average of the actor, see :func:`averaging`; the actor itself collects
+            and learns).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:
@@ -88,8 +88,7 @@ class SACStage(Stage):
         self.action_spec, out_key = self.emitted(muscles)
         self.actor = self.build_actor(inputs, self.action_spec, out_key=out_key, **actor).to(device)
         value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
-        averaging = average_of_late(sac["actor_average"])
-        self.average = AveragedModel(self.actor, multi_avg_fn=averaging)
+        self.average = AveragedModel(self.actor, multi_avg_fn=averaging(sac["actor_average"]))
         self.trained_policy = self.from_raw(self.average.module)
         policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
         super().__init__(make_env, policy, device=device, **stage)
@@ -225,7 +224,7 @@ def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
         yield from (p for p in params.parameters() if p.ndim == ndim)
 
 
-def average_of_late(share: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor], None]:
+def averaging(share: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor], None]:
     """How :class:`~torch.optim.swa_utils.AveragedModel` takes weights into its average.
 
     Of the average of ``n`` updates stays :math:`\\min(share, (1 + n) / (10 + n))`, as in
@@ -235,7 +234,7 @@ def average_of_late(share: float) -> Callable[[Sequence[Tensor], Sequence[Tensor
     Examples:
         >>> import torch
         >>> average = [torch.tensor([0.0])]
-        >>> average_of_late(0.9)(average, [torch.tensor([11.0])], torch.tensor(1))
+        >>> averaging(0.9)(average, [torch.tensor([11.0])], torch.tensor(1))
         >>> average  # two elevenths of it stayed
         [tensor([9.])]
     """
