@@ -184,8 +184,7 @@ def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[
     parts = [f"At {comparison.budget:,} environment frames, exploration included."]
     solved = any(np.isfinite(result.solved).any() for result in comparison.results)
     header = ["method", "seeds", "mean", "min to max", "IQM", "95 %", f"P(> {control})"]
-    header.append(f"frames to {control}'s")
-    header += ["solved", "solved time"] * solved + ["wall time [h]"]
+    header += [f"frames to {control}'s", *["solved", "solved time"] * solved, "wall time [h]"]
     if comparison.results:
         parts.append(_table(header, [_method_row(result, solved) for result in comparison.results]))
     notes = []

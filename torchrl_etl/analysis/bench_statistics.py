@@ -350,9 +350,10 @@ def _result(
 
 def _first_at(runs: Sequence[BenchRun], target: float, budget: int) -> int | None:
     """The first evaluation within the budget at which the mean over runs is at the target."""
-    evaluated = sorted({row.frames for run in runs for row in run.rows})
     begun = max(run.rows[0].frames for run in runs)
-    for frames in (f for f in evaluated if begun <= f <= 1.01 * budget):
+    end = max(run.at(budget).frames for run in runs)
+    evaluated = {row.frames for run in runs for row in run.rows if begun <= row.frames <= end}
+    for frames in sorted(evaluated):
         if np.mean([run.at(frames).mean_return for run in runs]) >= target:
             return frames
     return None
