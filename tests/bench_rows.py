@@ -12,7 +12,7 @@ FEW = 50  # resamples of a bootstrap
 
 def row(**cells):
     return {
-        "task": "myoHandPose",
+        "task": "myoHandKeyTurn",
         "goal": "fixed",
         "method": "sac",
         "seed": 0,

@@ -28,7 +28,7 @@ def test_looks_are_distinct_and_never_the_published_grey():
 
 
 def test_every_published_algorithm_has_a_look():
-    shown = [published_curves("dog-run"), published_curves("myoHandPoseFixed-v0", "success")]
+    shown = [published_curves("dog-run"), published_curves("myoHandKeyTurnFixed-v0", "success")]
     assert {curve.algorithm for curves in shown for curve in curves} == set(_PUBLISHED)
 
 
@@ -77,10 +77,10 @@ def test_report_from_end_to_end(tmp_path, capsys):
         "Evaluations of runs that were repeated later do not count (3)",
         "No run finished of eme.",
         "etl lacks dog-run (fixed)",
-        "dep lacks myoHandPose (fixed)",
+        "dep lacks myoHandKeyTurn (fixed)",
         "Without a finished run that reached the budget: etl.",
         "unequal numbers of seeds",
-        "- myoHandPose (fixed), etl, seed 9: killed: out of memory, last evaluated at 100,000",
+        "- myoHandKeyTurn (fixed), etl, seed 9: killed: out of memory, last evaluated at 100,000",
         "- dog-walk (fixed), eme, seed 0: diverged, last evaluated at 50,000 frames",
         "| fff0000 | 3 |",
         "| other \\| class | 1 |",
@@ -91,7 +91,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
     ):
         assert words in text, words
     assert "7,777" not in text
-    for name in ("overall", "myoHandPose-fixed", "dog-run-fixed"):
+    for name in ("overall", "myoHandKeyTurn-fixed", "dog-run-fixed"):
         assert f"({name}.png)" in text
         with Image.open(out / f"{name}.png") as image:
             assert len(image.convert("RGB").getcolors(image.width * image.height)) > 20

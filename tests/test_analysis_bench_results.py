@@ -21,13 +21,13 @@ def test_a_run_is_as_finished_as_its_newest_row(tmp_path):
     going[-1]["status"] = "finished"
     results = bench(tmp_path, run([0, 1]), broken, going)
     assert [one.seed for one in results.finished] == [0, 2]
-    assert [str(one) for one in results.unfinished] == ["myoHandPose (fixed), sac, seed 1"]
+    assert [str(one) for one in results.unfinished] == ["myoHandKeyTurn (fixed), sac, seed 1"]
 
 
 def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
-    tasks = ("aFarTask", "dog-run", "myoHandPose")
+    tasks = ("aFarTask", "dog-run", "myoHandKeyTurn")
     results = bench(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))
-    assert [task for task, _ in results.settings] == ["myoHandPose", "dog-run", "aFarTask"]
+    assert [task for task, _ in results.settings] == ["myoHandKeyTurn", "dog-run", "aFarTask"]
     assert {goal for _, goal in results.settings} == {"fixed"}
 
 
@@ -66,6 +66,6 @@ def test_missing_things_are_named(tmp_path):
         read_bench(tmp_path)
     folder = write(tmp_path, [row()])
     with (folder / "results.csv").open("a") as file:
-        file.write("myoHandPose,fixed,sac,0,1000")
+        file.write("myoHandKeyTurn,fixed,sac,0,1000")
     with pytest.raises(ValueError, match="line 3: the number of cells"):
         read_bench(folder)

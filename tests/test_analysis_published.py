@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from torchrl_etl.analysis.published import best_published, caveats, environment_id, published_curves
-from torchrl_etl.envs import list_tasks
+from torchrl_etl.envs import list_tasks, resolve_task
 
 
 def test_published_rows_belong_to_tasks_of_ours():
     published = {
         environment_id(task.name, goal)
-        for task in list_tasks()
+        for task in (*list_tasks(), resolve_task("myo2HandPose"))
         for goal in task.goals
         if published_curves(environment_id(task.name, goal))
     }

@@ -51,14 +51,20 @@ def environment_id(task: str, goal: str = "fixed") -> str:
     """The id under which others publish a task; a name that this project has not named itself.
 
     Unlike :func:`~torchrl_etl.envs.resolve_task` it builds and imports nothing, and passes unknown
-    names through, for results outlive the environments that they came from.
+    names through, for results outlive the environments that they came from. Hand Pose was published
+    with the hand of MyoSuite 2; nothing is with that of MyoSuite 3.
 
     Examples:
-        >>> environment_id("myoHandPose", "random"), environment_id("dog-run")
-        ('myoHandPoseRandom-v0', 'dog-run')
+        >>> environment_id("myoHandKeyTurn", "random"), environment_id("dog-run")
+        ('myoHandKeyTurnRandom-v0', 'dog-run')
+        >>> environment_id("myo2HandPose"), environment_id("myoHandPose")
+        ('myoHandPoseFixed-v0', 'myoHandPose')
     """
+    if task == "myoHandPose":
+        return task
+    name = "myoHandPose" if task == "myo2HandPose" else task
     for known in list_tasks():
-        if known.name == task:
+        if known.name == name:
             return replace(known, goal=goal).env_id
     return task
 

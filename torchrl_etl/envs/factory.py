@@ -13,6 +13,7 @@ from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
+from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
 from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.envs.tasks import Goal, Task, resolve_task
@@ -226,7 +227,7 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
         env = suite.load(domain, task_name, **env_kwargs)
         return DmControlCompatibilityV0(env), (PhysicsError,)
     if task.suite == "myosuite":
-        import myosuite  # noqa: F401  (importing it registers its environments)
+        register_myosuite()
     # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
     return gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
 

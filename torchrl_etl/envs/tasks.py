@@ -14,6 +14,7 @@ from typing import Literal
 
 import gymnasium as gym
 
+from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
 
 __all__ = ["Task", "episode_length", "list_tasks", "resolve_task"]
@@ -108,10 +109,18 @@ _FULL = tuple(
     if task.name in ("myoBaoding", "myoDieReorient", "myoRelocate")
 )
 
-_BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _ANALYTIC)}
+# Hand Pose as everybody else's results are of it; MyoSuite 3's is another task.
+_MYO2 = replace(
+    _PAPER[0],
+    name="myo2HandPose",
+    id="torchrl_etl/Myo2HandPoseFixed-v0",
+    random_id="torchrl_etl/Myo2HandPoseRandom-v0",
+)
+
+_BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _MYO2, _ANALYTIC)}
 _BY_ID = {
     env_id: replace(task, goal=goal)
-    for task in (*_PAPER, _ANALYTIC)
+    for task in (*_PAPER, _MYO2, _ANALYTIC)
     if task.suite != "dm_control"
     for goal, env_id in zip(("fixed", "random"), (task.id, task.random_id), strict=True)
     if env_id is not None
@@ -137,9 +146,10 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
     """Finds the task that a name stands for, without building it.
 
     Args:
-        name (str): a short name of :func:`list_tasks` or ``"overactuated"``; any environment id
-            registered with Gymnasium (MyoSuite's are registered on demand; ``"module:id"`` imports
-            ``module`` first); or any DMControl ``"domain-task"``, e.g. ``"cheetah-run"``.
+        name (str): a short name of :func:`list_tasks`, ``"myo2HandPose"`` or ``"overactuated"``;
+            any environment id registered with Gymnasium (MyoSuite's are registered on demand;
+            ``"module:id"`` imports ``module`` first); or any DMControl ``"domain-task"``, e.g.
+            ``"cheetah-run"``.
         goal (str, optional): ``"fixed"`` or ``"random"``. ``None`` (default) is the fixed goal for
             a short name, and whatever the id says for an environment id.
 
@@ -159,7 +169,7 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
         Traceback (most recent call last):
         ...
         ValueError: myoBaoding has no random goal; the tasks that have both goals are myoHandPose, \
-myoHandKeyTurn, myoHandPenTwirl, overactuated.
+myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
     """
     if not isinstance(name, str):
         raise TypeError(f"A task is named by a string, got {type(name).__name__}.")
@@ -229,7 +239,7 @@ def _registered(name: str) -> bool:
     if module:
         importlib.import_module(module)
     if env_id not in gym.registry:
-        import myosuite  # noqa: F401  (importing it registers its environments)
+        register_myosuite()
     return env_id in gym.registry
 
 
