@@ -68,6 +68,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("learn.sac.hold.exponent=0", "learn.sac.hold.exponent is 0; it must be a number above 0"),
         ("learn.sac.hold.longest=x", "longest is 'x'; it must be a whole number above 0"),
         ("learn.sac.lr_end=2", "lr_end is 2; it must be a share in [0, 1]"),
+        ("learn.sac.n_steps=0", "n_steps is 0; it must be a whole number above 0"),
         ("learn.sac.actor_average=1", "actor_average is 1; it must be a share in [0, 1)"),
         ("learn.sac.unit_rows=1", "unit_rows is 1; it must be true or false"),
         ("critic.body=resnet", "choose one of mlp, residual"),

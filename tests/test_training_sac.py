@@ -140,6 +140,63 @@ def test_an_average_that_keeps_nothing_is_the_actor():
     stage.close()
 
 
+def six_steps(ends_after):
+    """Rewards 1 to 6 from observations 0 to 5, one episode ending after a step."""
+    end = (torch.arange(1, 7) == ends_after).view(1, 6, 1)
+    observation = torch.arange(7.0).view(1, 7, 1)
+    following = {"reward": observation[:, 1:], "observation": observation[:, 1:]}
+    following |= {"done": end, "terminated": end, "truncated": torch.zeros_like(end)}
+    return TensorDict({"observation": observation[:, :-1], "next": following}, [1, 6])
+
+
+def test_a_transition_spans_n_steps_but_no_end_of_an_episode_or_a_batch():
+    stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
+    batch = six_steps(ends_after=3)
+    spanned = stage.spanned(batch)
+    # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4, 5 + 6/2, 6
+    following = spanned["next"].squeeze(0).squeeze(-1)
+    assert following["reward"].squeeze(-1).tolist() == [2.75, 3.5, 3.0, 8.0, 8.0, 6.0]
+    assert following["observation"].squeeze(-1).tolist() == [3, 3, 3, 6, 6, 6]
+    for end in ("terminated", "done"):
+        assert following[end].squeeze(-1).tolist() == [True, True, True, False, False, False]
+    assert spanned["steps_to_next_obs"].tolist() == [[3, 2, 1, 3, 2, 1]]
+    assert torch.equal(spanned["observation"], batch["observation"])
+    assert batch["next", "reward"].flatten().tolist() == [1, 2, 3, 4, 5, 6], "logs read the batch"
+    # The target: rewards and, unless the episode ended, γ^k times what follows, here 8.
+    target = stage.sac._bootstrap(spanned.reshape(-1), torch.full((6,), 8.0))
+    assert target.tolist() == [2.75, 3.5, 3.0, 9.0, 10.0, 10.0]
+    stage.close()
+
+
+def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many():
+    stage = learn_stage(None)
+    batch = six_steps(ends_after=3)
+    assert stage.spanned(batch) is batch
+    fill(stage)
+    assert "steps_to_next_obs" not in stage.buffer.storage[:].keys()
+    stage.close()
+    stage = learn_stage(None, "learn.sac.n_steps=3")
+    fill(stage)
+    rows = stage.buffer.storage[:].clone()
+    assert set(rows["steps_to_next_obs"].flatten().tolist()) == {1, 2, 3}
+    assert stage.update()["loss_qvalue"].isfinite()
+    # What stage 1 has collected is of single steps.
+    stage.take(rows.select("observation", "synergy", "action", "next"))
+    assert set(stage.newest(len(rows))["steps_to_next_obs"].flatten().tolist()) == {1}
+    assert stage.update()["loss_qvalue"].isfinite()
+    stage.close()
+
+
+def test_the_bonus_of_eme_stays_one_of_single_steps():
+    stage = Experiment(tiny("method=eme", "learn.sac.n_steps=3", "run_dir=unused"))
+    stage = stage.learn_stage(None)
+    stage.restart_collection()
+    fill(stage)
+    assert set(stage.buffer.storage[:]["steps_to_next_obs"].flatten().tolist()) == {1}
+    assert stage.update()["loss_qvalue"].isfinite()
+    stage.close()
+
+
 def test_learning_rates_fall_in_a_line_with_the_frames():
     stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
     initial = [group["lr"] for group in stage.optimizer.param_groups]

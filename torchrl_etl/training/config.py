@@ -93,6 +93,7 @@ _RULES: tuple[_Rule, ...] = (
             "explore.encoder.embedding_dim",
             "learn.critic.bins",
             "learn.sac.hold.longest",
+            "learn.sac.n_steps",
             "learn.sac.num_critics",
             *_both("frames"),
         ),

@@ -169,10 +169,16 @@ class SAR(Method):
 
 
 class PlayStage(SACStage):
-    """SAC on the task that remembers which muscle activations came of it, by episode."""
+    """SAC on the task that remembers which muscle activations came of it, by episode.
+
+    They are of single steps: ``sac.n_steps`` is not read.
+    """
 
     name = "play"
     kept = ("observation", "action", ("collector", "traj_ids"))
+
+    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = super().transitions(batch)

@@ -118,6 +118,8 @@ class DynSynStage(SACStage):
 class EMEStage(SACStage):
     """EME (Wang 2024): a bonus for steps that are long in a metric of reward and policy.
 
+    Its bonus and its metric are of single steps: ``sac.n_steps`` is not read.
+
     Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
 
     Keyword Args:
@@ -150,6 +152,9 @@ class EMEStage(SACStage):
 
     def groups(self, lr: float) -> list[tuple[list[Tensor], float]]:
         return [*super().groups(lr), (list(self.metric.parameters()), self._eme["lr"])]
+
+    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         loss, scalars = super().losses(batch)

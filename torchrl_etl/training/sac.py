@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import Bounded
+from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
@@ -52,9 +53,11 @@ class SACStage(Stage):
             critics see what :class:`~torchrl_etl.modules.RunningNorm` makes of them),
             ``unit_rows`` (the rows of all their linear layers keep unit length), ``num_critics``
             (the smallest of whose values counts), ``lr_end`` (share of every learning rate that
-            is left at the last frame; they fall linearly) and ``actor_average`` (the trained policy
+            is left at the last frame; they fall linearly), ``actor_average`` (the trained policy
             is an exponential average of the actor, see :func:`averaging`; the actor itself collects
-            and learns).
+            and learns) and ``n_steps`` (rewards in a critic's target before it bootstraps; fewer
+            at the end of a batch or an episode. Of the steps between, which the target takes as
+            they were collected, no entropy counts).
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:
@@ -90,6 +93,7 @@ class SACStage(Stage):
         value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
         self.average = AveragedModel(self.actor, multi_avg_fn=averaging(sac["actor_average"]))
         self.trained_policy = self.from_raw(self.average.module)
+        self.multi_step = multi_step(sac["n_steps"], sac["gamma"])
         policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
         super().__init__(make_env, policy, device=device, **stage)
         bound = sac["return_bound"]
@@ -170,7 +174,13 @@ class SACStage(Stage):
         kept = batch.select(*self.kept, ("next", "observation"))
         kept["next"].update(batch["next"].select("done", "terminated"))
         kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
+        if self.multi_step is not None:
+            single = torch.ones(batch.batch_size, dtype=torch.long, device=self.device)
+            kept["steps_to_next_obs"] = batch.get("steps_to_next_obs", single)
         return kept
+
+    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch if self.multi_step is None else self.multi_step(batch)
 
     def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         return super().gradients(self.observed(batch))
@@ -216,6 +226,15 @@ class SACStage(Stage):
         if self.norm is not None:
             self.norm.see(batch["observation"])
         return batch
+
+
+def multi_step(n_steps: int, gamma: float) -> MultiStep | None:
+    """Sums the rewards of ``n_steps`` steps, and moves what follows the first after the last."""
+    if n_steps == 1:
+        return None
+    span = MultiStep(gamma, n_steps)
+    span.done_keys = ()  # TorchRL 0.14.1 leaves them at the first step, and bootstraps past an end
+    return span
 
 
 def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:

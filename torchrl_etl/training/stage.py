@@ -152,6 +152,10 @@ class Stage(ABC):
         """A batch [simulators, time] as it came, once a stage has taken note of what it wants."""
         return batch
 
+    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
+        """A batch [simulators, time] whose transitions span the steps that a target looks ahead."""
+        return batch
+
     # What every stage does -------------------------------------------------------------------
 
     @property
@@ -178,8 +182,9 @@ class Stage(ABC):
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
-        batch = self.seen(self.batches.next().to(self.device)).reshape(-1)
-        self.buffer.extend(self.transitions(batch))
+        batch = self.seen(self.batches.next().to(self.device))
+        self.buffer.extend(self.transitions(self.spanned(batch).reshape(-1)))
+        batch = batch.reshape(-1)
         self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
         if self.frames > self.learning_starts:
