@@ -52,5 +52,6 @@ def _without_key(spec: Any) -> Any:
 
 def _old_order(joints: Any) -> list[Any]:
     """The thumb's abduction before its flexion."""
-    *before, flexion, abduction = list(joints)[:5]
-    return [*before, abduction, flexion, *list(joints)[5:]]
+    joints = list(joints)
+    joints[3], joints[4] = joints[4], joints[3]
+    return joints

@@ -109,12 +109,14 @@ _FULL = tuple(
     if task.name in ("myoBaoding", "myoDieReorient", "myoRelocate")
 )
 
-# Hand Pose as everybody else's results are of it; MyoSuite 3's is another task.
-_MYO2 = replace(
-    _PAPER[0],
-    name="myo2HandPose",
-    id="torchrl_etl/Myo2HandPoseFixed-v0",
-    random_id="torchrl_etl/Myo2HandPoseRandom-v0",
+# The Hand Pose that others have published results of; MyoSuite 3's is another task.
+_MYO2 = Task(
+    "myo2HandPose",
+    "torchrl_etl/Myo2HandPoseFixed-v0",
+    "torchrl_etl/Myo2HandPoseRandom-v0",
+    "myosuite",
+    100,
+    True,
 )
 
 _BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _MYO2, _ANALYTIC)}
