@@ -143,10 +143,10 @@ def test_frames_to_the_controls_return_are_those_of_the_mean_over_seeds(tmp_path
 
 def test_unequal_seeds_and_missing_tasks(tmp_path):
     """By hand. Key Turn at 100,000: zero −100, one 2211.99 (FlashSAC). Leg Walk: one is SAC's."""
-    pose = [run([-100, 0, 2211.99], method="sac", seed=s) for s in (0, 1, 2)]
+    turn = [run([-100, 0, 2211.99], method="sac", seed=s) for s in (0, 1, 2)]
     better = [run([-100, 0, 2211.99 + 2311.99], method="etl", seed=s) for s in (0, 1)]
     walk = [run([-50, 0, 50], task="myoLegWalk", seed=s) for s in (0, 1)]
-    results = bench(tmp_path, *pose, *better, *walk)
+    results = bench(tmp_path, *turn, *better, *walk)
     comparisons = [
         compare(
             [one for one in results.runs if one.setting == setting],
