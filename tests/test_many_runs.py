@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import pytest
 import torch
-from benchmarks.many_runs.learner import Learner, Settings, Shape
-from benchmarks.many_runs.returns import ReturnScales
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
+from benchmarks.many_runs.learner import Learner, Settings, Shape
+from benchmarks.many_runs.returns import ReturnScales
 from torchrl_etl.modules import ReturnScale, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
 from torchrl_etl.training.stage import entropy_target, ready_for_training
 
 CPU = torch.device("cpu")
-SHAPE = Shape(actor=8, critic=16, batch_size=5, bins=11, frames=40, most_steps=3)
+SHAPE = Shape(actor=8, critic=16, batch_size=5, bins=11, most_steps=3)
 SETTINGS = [Settings(gamma=0.9), Settings(n_steps=3, alpha_init=0.1)]
 
 
 def stacked(shape=SHAPE, decoders=None):
-    learner = Learner(shape, SETTINGS, [3, 4], [7, 4], 6, decoders, CPU)
+    learner = Learner(shape, SETTINGS, [3, 4], [7, 4], 6, decoders, 40, CPU)
     torch.manual_seed(0)
     learner.told[:, 4:].normal_()
     for step in range(20):
@@ -34,7 +34,9 @@ def stacked(shape=SHAPE, decoders=None):
 
 @pytest.mark.parametrize("synergies", [False, True])
 def test_losses_and_gradients_are_those_of_the_package(monkeypatch, synergies):
-    zeros = lambda shape, dtype, device: torch.zeros(shape, dtype=dtype, device=device)
+    def zeros(shape, dtype, device):
+        return torch.zeros(shape, dtype=dtype, device=device)
+
     monkeypatch.setattr("torch.distributions.normal._standard_normal", zeros)
     decoders = None
     if synergies:

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from .networks import BatchNormBody, Mlp, ResidualBody, Stack
 from torchrl_etl.functional import categorical_mean, project_categorical
 from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import LeanSACLoss
+
+from .networks import BatchNormBody, Mlp, ResidualBody, Stack
 
 __all__ = ["Learner", "Settings", "Shape"]
 
@@ -42,7 +43,6 @@ class Shape:
     tau: float = 0.01
     unit_rows: bool = False
     learning_starts: int = 500
-    frames: int = 100_000
     longest: int = 16
     most_steps: int = 1
     share: float = 0.9995
@@ -75,6 +75,8 @@ class Learner:
         actions (int): muscles, with bounds of [-1, 1].
         decoders (sequence of SynergyDecoder, optional): of each run, alike in size; ``None``: the
             actor emits muscles.
+        frames (int): to make room for.
+        device (torch.device): of all tensors.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Learner:
         observations: Sequence[int],
         actions: int,
         decoders: Sequence[SynergyDecoder] | None,
+        frames: int,
         device: torch.device,
     ) -> None:
         self.shape, self.device = shape, device
@@ -126,7 +129,7 @@ class Learner:
 
         sizes = {"observation": self.width, "following": self.width, "emitted": self.emitted}
         sizes |= {"action": actions, "reward": 1, "terminated": 1, "done": 1}
-        self.buffer = {name: zeros(shape.frames, size) for name, size in sizes.items()}
+        self.buffer = {name: zeros(frames, size) for name, size in sizes.items()}
         self.size = torch.zeros((), dtype=torch.long, device=device)
         self.updates = torch.zeros((), device=device)
         # What simulators tell: reward, terminated, done, the scale of rewards, and what was seen

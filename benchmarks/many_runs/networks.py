@@ -67,9 +67,8 @@ class BatchNormBody:
         cls, networks: Sequence[Sequence[Tensor]], blocks: int, device: torch.device
     ) -> BatchNormBody:
         """A body with untrained statistics for networks of :meth:`initial`."""
-        scales = [networks[0][0]]
-        for first in range(4, 4 + 8 * blocks, 4):
-            scales.append(networks[0][first + 2])
+        first = networks[0]
+        scales = [first[0], *(first[i] for i in range(6, 6 + 8 * blocks, 4))]
         running = []
         for scale in scales:
             shape = (len(networks), scale.numel())
@@ -79,11 +78,13 @@ class BatchNormBody:
     @staticmethod
     def initial(inputs: int, width: int, blocks: int, outputs: int) -> list[Tensor]:
         """Weights of one network."""
-        norm = lambda size: [torch.ones(size), torch.zeros(size)]
-        line = lambda i, o: [
-            nn.functional.normalize(torch.randn(o, i), dim=-1),
-            torch.zeros(o),
-        ]
+
+        def norm(size: int) -> list[Tensor]:
+            return [torch.ones(size), torch.zeros(size)]
+
+        def line(i: int, o: int) -> list[Tensor]:
+            return [nn.functional.normalize(torch.randn(o, i), dim=-1), torch.zeros(o)]
+
         weights = [*norm(inputs), *line(inputs, width)]
         for _ in range(blocks):
             weights += [*line(width, 4 * width), *norm(4 * width)]
@@ -147,8 +148,7 @@ class Stack:
 
     @torch.no_grad()
     def normalize_rows(self) -> None:
-        """Rows of linear layers to length one, scales of normalization to root mean square one."""
-        parts = self.split(self.weights)
-        for i, part in enumerate(parts):
+        """Rows of linear layers to length one."""
+        for part in self.split(self.weights):
             if part.ndim == 3:
                 part.div_(part.norm(dim=-1, keepdim=True).clamp_min(1e-8))

@@ -1,4 +1,4 @@
-"""One simulator for every run, stepped by a few processes that share their arrays with the learner."""
+"""One simulator for every run, stepped by processes that share their arrays with the learner."""
 
 from __future__ import annotations
 
