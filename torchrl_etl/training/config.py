@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
+from torchrl_etl.modules.actor_critic import Body
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.training.methods import METHODS
 
@@ -29,7 +30,7 @@ _CHOICES = {
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
     "learn.sac.noise": ("independent", "held"),
     **{
-        f"{section}{network}.body": ("mlp", "residual")
+        f"{section}{network}.body": get_args(Body)
         for section in ("", "explore.", "learn.")
         for network in ("actor", "critic")
     },
