@@ -374,6 +374,20 @@ def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
     torch.testing.assert_close(network(observation), head(norm(hidden)))
 
 
+def test_products_of_a_bfloat16_body_are_all_that_is_of_that_precision() -> None:
+    torch.manual_seed(0)
+    exact = make_critic({"observation": 3}, body="residual", hidden=(16, 16)).module
+    network = make_critic({"observation": 3}, body="residual_bfloat16", hidden=(16, 16)).module
+    network.load_state_dict(exact.state_dict())
+    observation = torch.randn(6, 3)
+    out = network(observation)
+    out.sum().backward()
+    assert out.dtype == torch.float32
+    assert all(p.grad.dtype == torch.float32 for p in network.parameters())
+    error = (out - exact(observation)).abs().max()
+    assert 0 < error < 0.02 * exact(observation).std()
+
+
 def test_a_residual_body_is_of_one_width_and_known_bodies_are_named() -> None:
     with pytest.raises(ValueError, match=r"hidden is \[4, 8\].*one width"):
         make_critic({"observation": 3}, body="residual", hidden=(4, 8))
