@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+
+import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,8 +14,11 @@ from torchrl.data import Bounded
 
 from benchmarks.many_runs.learner import Learner, Settings, Shape
 from benchmarks.many_runs.returns import ReturnScales
+from tests.configs import ROOT, tiny
 from torchrl_etl.modules import ReturnScale, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
+from torchrl_etl.training import Experiment
+from torchrl_etl.training.evaluation import evaluate
 from torchrl_etl.training.stage import entropy_target, ready_for_training
 
 CPU = torch.device("cpu")
@@ -141,3 +149,28 @@ def test_updates_change_every_part(body, unit_rows):
     after = [getattr(learner, name) for name in names] + learner.trained
     for old, new in zip(before + parts, after, strict=True):
         assert new.isfinite().all() and not torch.equal(old, new)
+
+
+def test_a_run_begins_where_the_recipe_begins_and_ends_in_a_table(tmp_path):
+    runs = [
+        {"task": "overactuated", "goal": goal, "seed": 3, "method": "sac"}
+        for goal in ("fixed", "random")
+    ]
+    shape = {"learning_starts": 4, "batch_size": 8}
+    described = {"frames": 6, "groups": [{"shape": shape, "runs": [run]} for run in runs]}
+    (tmp_path / "runs.json").write_text(json.dumps(described))
+    command = [sys.executable, "-m", "benchmarks.many_runs", str(tmp_path / "runs.json")]
+    out = tmp_path / "results.csv"
+    command += ["--out", str(out), "--every", "4", "--workers", "2", "--commit", "abc"]
+    subprocess.run(command, check=True, cwd=ROOT, timeout=120)
+    table = pd.read_csv(out)
+    assert table["frames"].tolist() == [0, 0, 4, 4, 6, 6]
+    assert set(table["status"]) == {"finished"} and set(table["commit"]) == {"abc"}
+    assert table["return"].notna().all()
+    for goal, row in zip(("fixed", "random"), table.itertuples(), strict=False):
+        options = ("learner=residual", "method=sac", "seed=3", f"goal={goal}", "run_dir=unused")
+        experiment = Experiment(tiny(*options, "actor.hidden=[64,64]"))
+        policy = experiment.learn_stage(None).acting()["actor"]
+        env = experiment.make_env()
+        expected = evaluate(policy, env, episodes=row.episodes, max_steps=25)
+        assert row[6] == pytest.approx(expected.mean_return.mean, rel=1e-4)
