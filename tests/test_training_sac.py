@@ -140,38 +140,58 @@ def test_an_average_that_keeps_nothing_is_the_actor():
     stage.close()
 
 
-def six_steps(ends_after):
-    """Rewards 1 to 6 from observations 0 to 5, one episode ending after a step."""
+def six_steps(ends_after, begins=0):
+    """Rewards 1 to 6 from observations 0 to 5 (or so many more), an episode ending after a step."""
     end = (torch.arange(1, 7) == ends_after).view(1, 6, 1)
-    observation = torch.arange(7.0).view(1, 7, 1)
+    observation = begins + torch.arange(7.0).view(1, 7, 1)
     following = {"reward": observation[:, 1:], "observation": observation[:, 1:]}
     following |= {"done": end, "terminated": end, "truncated": torch.zeros_like(end)}
     return TensorDict({"observation": observation[:, :-1], "next": following}, [1, 6])
 
 
-def test_a_transition_spans_n_steps_but_no_end_of_an_episode_or_a_batch():
+def spans(rows):
+    """Of each transition: where it begins, its reward, where it ends and after how many steps."""
+    parts = (rows["observation"], rows["next", "reward"], rows["next", "observation"])
+    return list(
+        zip(*(part.flatten().tolist() for part in (*parts, rows["steps_to_next_obs"])), strict=True)
+    )
+
+
+def test_a_transition_spans_n_steps_but_no_end_of_an_episode():
     stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
     batch = six_steps(ends_after=3)
     spanned = stage.spanned(batch)
-    # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4, 5 + 6/2, 6
-    following = spanned["next"].squeeze(0).squeeze(-1)
-    assert following["reward"].squeeze(-1).tolist() == [2.75, 3.5, 3.0, 8.0, 8.0, 6.0]
-    assert following["observation"].squeeze(-1).tolist() == [3, 3, 3, 6, 6, 6]
+    # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4; the last two wait.
+    assert spans(spanned) == [(0, 2.75, 3, 3), (1, 3.5, 3, 2), (2, 3.0, 3, 1), (3, 8.0, 6, 3)]
     for end in ("terminated", "done"):
-        assert following[end].squeeze(-1).tolist() == [True, True, True, False, False, False]
-    assert spanned["steps_to_next_obs"].tolist() == [[3, 2, 1, 3, 2, 1]]
-    assert torch.equal(spanned["observation"], batch["observation"])
+        assert spanned["next", end].flatten().tolist() == [True, True, True, False]
     assert batch["next", "reward"].flatten().tolist() == [1, 2, 3, 4, 5, 6], "logs read the batch"
     # The target: rewards and, unless the episode ended, γ^k times what follows, here 8.
-    target = stage.sac._bootstrap(spanned.reshape(-1), torch.full((6,), 8.0))
-    assert target.tolist() == [2.75, 3.5, 3.0, 9.0, 10.0, 10.0]
+    target = stage.sac._bootstrap(spanned, torch.full((4,), 8.0))
+    assert target.tolist() == [2.75, 3.5, 3.0, 9.0]
     stage.close()
+
+
+def test_a_transition_spans_steps_of_the_next_batch_if_that_goes_on():
+    for size in (1, 2, 6):  # of the batches that the same 18 steps come in
+        stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
+        steps = torch.cat([six_steps(ends_after=3, begins=k) for k in (0, 6, 12)], 1)
+        rows = torch.cat([stage.spanned(part) for part in steps.split(size, 1)])
+        whole = stage.multi_step.__class__.__mro__[1].forward(stage.multi_step, steps)
+        assert spans(rows) == spans(whole)[:16]
+        # Episodes begin anew, as after a checkpoint: what waits is dropped.
+        stage.restart_collection()
+        assert spans(stage.spanned(six_steps(ends_after=3)))[0] == (0, 2.75, 3, 3)
+        # Another worker's batch: what waits spans the steps that are known.
+        other = spans(stage.spanned(six_steps(ends_after=0, begins=50)))
+        assert other[:3] == [(4, 8.0, 6, 2), (5, 6.0, 6, 1), (50, 51 + 52 / 2 + 53 / 4, 53, 3)]
+        stage.close()
 
 
 def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many():
     stage = learn_stage(None)
     batch = six_steps(ends_after=3)
-    assert stage.spanned(batch) is batch
+    assert (stage.spanned(batch) == batch.reshape(-1)).all()
     fill(stage)
     assert "steps_to_next_obs" not in stage.buffer.storage[:].keys()
     stage.close()

@@ -178,7 +178,7 @@ class PlayStage(SACStage):
     kept = ("observation", "action", ("collector", "traj_ids"))
 
     def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch
+        return batch.reshape(-1)
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = super().transitions(batch)

@@ -154,7 +154,7 @@ class EMEStage(SACStage):
         return [*super().groups(lr), (list(self.metric.parameters()), self._eme["lr"])]
 
     def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch
+        return batch.reshape(-1)
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         loss, scalars = super().losses(batch)

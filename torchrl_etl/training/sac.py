@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import Bounded
-from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
@@ -26,6 +25,7 @@ from torchrl_etl.modules import (
 )
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.objectives import LeanSACLoss
+from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
 from torchrl_etl.training.stage import Stage, entropy_target, make_optimizer, ready_for_training
 
 __all__ = ["SACStage"]
@@ -93,7 +93,9 @@ class SACStage(Stage):
         value = make_critic({**inputs, "action": muscles.shape[-1]}, **critic).to(device)
         self.average = AveragedModel(self.actor, multi_avg_fn=averaging(sac["actor_average"]))
         self.trained_policy = self.from_raw(self.average.module)
-        self.multi_step = multi_step(sac["n_steps"], sac["gamma"])
+        self.multi_step = None
+        if sac["n_steps"] > 1:
+            self.multi_step = ContinuedMultiStep(sac["gamma"], sac["n_steps"])
         policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
         super().__init__(make_env, policy, device=device, **stage)
         bound = sac["return_bound"]
@@ -180,7 +182,7 @@ class SACStage(Stage):
         return kept
 
     def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch if self.multi_step is None else self.multi_step(batch)
+        return super().spanned(batch) if self.multi_step is None else self.multi_step(batch)
 
     def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         return super().gradients(self.observed(batch))
@@ -217,6 +219,8 @@ class SACStage(Stage):
     def restart_collection(self) -> None:
         if self.return_scale is not None:
             self.return_scale.forget()
+        if self.multi_step is not None:
+            self.multi_step.forget()
         super().restart_collection()
 
     def seen(self, batch: TensorDictBase) -> TensorDictBase:
@@ -226,15 +230,6 @@ class SACStage(Stage):
         if self.norm is not None:
             self.norm.see(batch["observation"])
         return batch
-
-
-def multi_step(n_steps: int, gamma: float) -> MultiStep | None:
-    """Sums the rewards of ``n_steps`` steps, and moves what follows the first after the last."""
-    if n_steps == 1:
-        return None
-    span = MultiStep(gamma, n_steps)
-    span.done_keys = ()  # TorchRL 0.14.1 leaves them at the first step, and bootstraps past an end
-    return span
 
 
 def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:

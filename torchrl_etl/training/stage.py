@@ -153,8 +153,8 @@ class Stage(ABC):
         return batch
 
     def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        """A batch [simulators, time] whose transitions span the steps that a target looks ahead."""
-        return batch
+        """Transitions [*] of a batch [simulators, time], over the steps that a target looks ahead."""
+        return batch.reshape(-1)
 
     # What every stage does -------------------------------------------------------------------
 
@@ -183,11 +183,12 @@ class Stage(ABC):
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
         batch = self.seen(self.batches.next().to(self.device))
-        self.buffer.extend(self.transitions(self.spanned(batch).reshape(-1)))
+        if len(rows := self.spanned(batch)):
+            self.buffer.extend(self.transitions(rows))
         batch = batch.reshape(-1)
         self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
-        if self.frames > self.learning_starts:
+        if self.frames > self.learning_starts and len(self.buffer):
             self.earn(batch.numel())
         return batch
 
