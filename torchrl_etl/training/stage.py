@@ -153,7 +153,7 @@ class Stage(ABC):
         return batch
 
     def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        """Transitions [*] of a batch [simulators, time], over the steps that a target looks ahead."""
+        """Transitions [*] of a batch [simulators, time], over as many steps as a target spans."""
         return batch.reshape(-1)
 
     # What every stage does -------------------------------------------------------------------
