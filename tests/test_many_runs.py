@@ -158,13 +158,14 @@ def test_a_run_begins_where_the_recipe_begins_and_ends_in_a_table(tmp_path):
     ]
     shape = {"learning_starts": 4, "batch_size": 8}
     described = {"frames": 6, "groups": [{"shape": shape, "runs": [run]} for run in runs]}
+    runs[1]["charged"] = 1
     (tmp_path / "runs.json").write_text(json.dumps(described))
     command = [sys.executable, "-m", "benchmarks.many_runs", str(tmp_path / "runs.json")]
     out = tmp_path / "results.csv"
     command += ["--out", str(out), "--every", "4", "--workers", "2", "--commit", "abc"]
     subprocess.run(command, check=True, cwd=ROOT, timeout=120)
     table = pd.read_csv(out)
-    assert table["frames"].tolist() == [0, 0, 4, 4, 6, 6]
+    assert table["frames"].tolist() == [0, 1, 4, 5, 5, 6, 6]
     assert set(table["status"]) == {"finished"} and set(table["commit"]) == {"abc"}
     assert table["return"].notna().all()
     for goal, row in zip(("fixed", "random"), table.itertuples(), strict=False):

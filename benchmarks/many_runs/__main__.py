@@ -13,7 +13,8 @@ says which runs; their evaluations go to a table with the columns of the bench's
 
 Runs of a group have one ``shape`` (see ``learner.Shape``) and ``settings`` of their own (see
 ``learner.Settings``). They may all name ``synergies``, a bundle that was explored before, whose
-frames, ``charged``, are added to theirs; the group then has a ``residual`` too.
+frames, ``charged``, count among theirs; the group may then name a ``residual`` too. ``goals.py``
+writes such a file.
 """
 
 from __future__ import annotations
@@ -91,7 +92,9 @@ class ManyRuns:
         for group in self.groups:
             group.show(simulators)
         self.evaluate(0)
-        for frames in range(1, self.frames + 1):
+        pauses = {*range(0, self.frames, self.arguments.every), *map(self.own_frames, self.runs)}
+        last = max(pauses)
+        for frames in range(1, last + 1):
             self.act()
             simulators.send("step")
             for group in self.groups:
@@ -100,11 +103,15 @@ class ManyRuns:
             simulators.receive()
             for group in self.groups:
                 group.store(simulators)
-            if frames % self.arguments.every == 0 or frames == self.frames:
+            if frames in pauses:
                 self.evaluate(frames)
                 if time.monotonic() - self.started > self.arguments.seconds:
                     break
-        self.save("finished" if frames == self.frames else "stopped")
+        self.save("finished" if frames == last else "stopped")
+
+    def own_frames(self, run: dict[str, Any]) -> int:
+        """What exploration leaves of the budget."""
+        return self.frames - run.get("charged", 0)
 
     def act(self, *, trained: bool = False) -> None:
         for group in self.groups:
@@ -140,6 +147,8 @@ class ManyRuns:
         seconds = round(time.monotonic() - self.started, 1)
         logged = [row for group in self.groups for row in group.learner.logged.tolist()]
         for i, (run, (entropy, alpha, value)) in enumerate(zip(self.runs, logged, strict=True)):
+            if frames > self.own_frames(run):
+                continue
             tried = slice(self.episodes[i])
             self.rows.append(
                 {
