@@ -15,7 +15,7 @@ from torchrl.data import Bounded
 from benchmarks.many_runs.learner import Learner, Settings, Shape
 from benchmarks.many_runs.returns import ReturnScales
 from tests.configs import ROOT, tiny
-from torchrl_etl.modules import ReturnScale, SynergyDecoder, make_actor, make_critic
+from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
 from torchrl_etl.training import Experiment
 from torchrl_etl.training.evaluation import evaluate
@@ -29,7 +29,6 @@ SETTINGS = [Settings(gamma=0.9), Settings(n_steps=3, alpha_init=0.1)]
 def stacked(shape=SHAPE, decoders=None):
     learner = Learner(shape, SETTINGS, [3, 4], [7, 4], 6, decoders, 40, CPU)
     torch.manual_seed(0)
-    learner.told[:, 4:].normal_()
     for step in range(20):
         learner.act()
         learner.told.normal_()
@@ -115,6 +114,18 @@ def test_rewards_are_scaled_as_in_the_package():
         one = ReturnScale(gamma, bound=1.0)
         one.update(reward[i : i + 1], done[i : i + 1])
         assert many.scale()[i] == pytest.approx(one.scale.item())
+
+
+def test_observations_are_normalized_as_in_the_package():
+    learner = stacked(Shape(**{**vars(SHAPE), "normalize_observations": True}))
+    for i, own in enumerate((7, 4)):
+        norm = RunningNorm(own)
+        norm.see(learner.buffer["observation"][i, :20, :own])
+        seen = learner.told[i : i + 1, None, -7:]
+        torch.testing.assert_close(
+            learner._normal(seen.expand(2, 1, 7))[i, 0, :own], norm(seen[0, 0, :own])
+        )
+    assert (learner.sample()["observation"][1, :, 4:] == 0).all()
 
 
 def test_targets_of_three_steps_by_hand():

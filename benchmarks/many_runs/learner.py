@@ -42,6 +42,7 @@ class Shape:
     lr: float = 3e-4
     tau: float = 0.01
     unit_rows: bool = False
+    normalize_observations: bool = False
     learning_starts: int = 500
     longest: int = 16
     most_steps: int = 1
@@ -131,6 +132,9 @@ class Learner:
         sizes |= {"action": actions, "reward": 1, "terminated": 1, "done": 1}
         self.buffer = {name: zeros(frames, size) for name, size in sizes.items()}
         self.size = torch.zeros((), dtype=torch.long, device=device)
+        # Moments of the observations that were seen, as of torchrl_etl.modules.RunningNorm.
+        self.mean, self.squares = zeros(self.width).double(), zeros(self.width).double()
+        self.counted = torch.zeros((), dtype=torch.float64, device=device)
         self.updates = torch.zeros((), device=device)
         # What simulators tell: reward, terminated, done, the scale of rewards, and what was seen
         # after the step and is seen now.
@@ -159,7 +163,8 @@ class Learner:
     def act(self) -> None:
         """Muscles [N, n] for what is seen now; noise is held for some steps."""
         self.seen.copy_(self.told[:, -self.width :])
-        loc, scale = self._policy(self.seen.unsqueeze(1), self.actor.weights)
+        self._count(self.seen)
+        loc, scale = self._policy(self._normal(self.seen.unsqueeze(1)), self.actor.weights)
         fresh = (self.told[:, 2:3] > 0) | (self.left == 0)
         lengths = 1 + torch.searchsorted(self.chances, torch.rand_like(self.chances[:, :1]))
         lengths = lengths.clamp(max=self.shape.longest)
@@ -173,7 +178,7 @@ class Learner:
     @torch.no_grad()
     def try_out(self) -> None:
         """Muscles that the averaged actor chooses, without noise."""
-        loc, _ = self._policy(self.told[:, None, -self.width :], self.average)
+        loc, _ = self._policy(self._normal(self.told[:, None, -self.width :]), self.average)
         self.muscles.copy_(self._decode(loc.tanh()).squeeze(1))
 
     @torch.no_grad()
@@ -297,9 +302,25 @@ class Learner:
             reward = reward + further * discount * at("reward", last)
             discount = torch.where(further, discount * self.gamma, discount)
         entries = {name: pick(name, first) for name in ("observation", "emitted", "action")}
-        entries["following"] = pick("following", last)
+        entries["following"] = self._normal(pick("following", last))
+        entries["observation"] = self._normal(entries["observation"])
         entries["reward"] = reward / self.told[:, 3:4]
         return entries | {"discount": discount * (1 - at("terminated", last))}
+
+    def _count(self, seen: Tensor) -> None:
+        self.counted += 1
+        shift = seen - self.mean
+        self.mean += shift / self.counted
+        self.squares += shift * (seen - self.mean)
+
+    def _normal(self, observation: Tensor) -> Tensor:
+        """Observations [N, *, O] in deviations of those seen, if the shape says so."""
+        if not self.shape.normalize_observations:
+            return observation
+        variance = self.squares / self.counted.clamp(min=1)
+        deviation = torch.where(variance > 1e-12, variance, 1.0).sqrt()
+        shifted = observation - self.mean.float().unsqueeze(1)
+        return (shifted / deviation.float().unsqueeze(1)).clamp(-10, 10)
 
     @torch.no_grad()
     def constrain(self) -> None:
@@ -321,6 +342,7 @@ class Learner:
         """Make CUDA graphs of what a run does; whatever that changes is put back."""
         changed = [self.actor.weights, self.critic.weights, self.log_alpha, self.target]
         changed += [self.average, self.size, self.updates, self.told, self.noise, self.left]
+        changed += [self.mean, self.squares, self.counted]
         for body in (self.actor.body, self.critic.body, self.target_body):
             changed += getattr(body, "running", [])
         if self.decoder is not None:
