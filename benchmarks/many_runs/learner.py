@@ -42,7 +42,7 @@ class Shape:
     lr: float = 3e-4
     tau: float = 0.01
     unit_rows: bool = False
-    normalize_observations: bool = False
+    normalize_observations: bool = True
     learning_starts: int = 500
     longest: int = 16
     most_steps: int = 1
