@@ -22,9 +22,7 @@ from torchrl_etl.training.evaluation import evaluate
 from torchrl_etl.training.stage import entropy_target, ready_for_training
 
 CPU = torch.device("cpu")
-SHAPE = Shape(
-    actor=8, critic=16, batch_size=5, bins=11, most_steps=3, normalize_observations=False
-)
+SHAPE = Shape(actor=8, critic=16, batch_size=5, bins=11, most_steps=3, normalize_observations=False)
 SETTINGS = [Settings(gamma=0.9), Settings(n_steps=3, alpha_init=0.1)]
 
 
