@@ -258,7 +258,7 @@ def test_a_compiled_update_is_the_same_update(learner):
     stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])
     batch = stages[0].buffer.sample()
-    stages[1].return_scale = stages[0].return_scale
+    stages[1].return_scale, stages[1].norm = stages[0].return_scale, stages[0].norm
     stages[1].sac.load_state_dict(stages[0].sac.state_dict())
     outs = []
     for stage in stages:
