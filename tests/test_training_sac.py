@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data.postprocs import MultiStep
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.configs import tiny
@@ -177,7 +178,7 @@ def test_a_transition_spans_steps_of_the_next_batch_if_that_goes_on():
         stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
         steps = torch.cat([six_steps(ends_after=3, begins=k) for k in (0, 6, 12)], 1)
         rows = torch.cat([stage.spanned(part) for part in steps.split(size, 1)])
-        whole = stage.multi_step.__class__.__mro__[1].forward(stage.multi_step, steps)
+        whole = MultiStep.forward(stage.multi_step, steps)
         assert spans(rows) == spans(whole)[:16]
         # Episodes begin anew, as after a checkpoint: what waits is dropped.
         stage.restart_collection()

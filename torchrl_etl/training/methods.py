@@ -23,6 +23,7 @@ from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.rivals import DEPStage, DynSynStage, EMEStage, LatticeStage
 from torchrl_etl.training.sac import SACStage
+from torchrl_etl.training.stage import Stage
 
 if TYPE_CHECKING:
     from torchrl_etl.training.experiment import Experiment
@@ -177,8 +178,7 @@ class PlayStage(SACStage):
     name = "play"
     kept = ("observation", "action", ("collector", "traj_ids"))
 
-    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch.reshape(-1)
+    spanned = Stage.spanned  # of single steps
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
         kept = super().transitions(batch)

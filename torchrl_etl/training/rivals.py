@@ -24,7 +24,7 @@ from torchrl_etl.baselines import (
 from torchrl_etl.modules import StateEncoder
 from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss
 from torchrl_etl.training.sac import SACStage
-from torchrl_etl.training.stage import entropy_target
+from torchrl_etl.training.stage import Stage, entropy_target
 
 __all__ = ["DEPStage", "DynSynStage", "EMEStage", "LatticeStage"]
 
@@ -153,8 +153,7 @@ class EMEStage(SACStage):
     def groups(self, lr: float) -> list[tuple[list[Tensor], float]]:
         return [*super().groups(lr), (list(self.metric.parameters()), self._eme["lr"])]
 
-    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch.reshape(-1)
+    spanned = Stage.spanned  # of single steps
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         loss, scalars = super().losses(batch)
