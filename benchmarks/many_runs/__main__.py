@@ -11,8 +11,8 @@ says which runs; their evaluations go to a table with the columns of the bench's
         {"task": "myo2HandPose", "goal": "fixed", "seed": 100, "method": "sac_2_updates_3_steps",
          "settings": {"n_steps": 3}}]}]}
 
-Runs of a group have one ``shape`` (see ``learner.Shape``) and ``settings`` of their own (see
-``learner.Settings``). They may all name ``synergies``, a bundle that was explored before, whose
+Runs of a group have one ``shape`` (see ``settings.Shape``) and ``settings`` of their own (see
+``settings.Settings``). They may all name ``synergies``, a bundle that was explored before, whose
 frames, ``charged``, count among theirs; the group may then name a ``residual`` too. ``goals.py``
 writes such a file.
 """
@@ -84,8 +84,19 @@ class ManyRuns:
             rows = slice(first, first + len(group["runs"]))
             sees, first = observations[rows], rows.stop
             self.groups.append(Group(group, rows, sees, actions, self.frames, arguments.device))
+        self.facts = self.known_facts()
         self.rows: list[dict[str, Any]] = []
         self.started = time.monotonic()
+
+    def known_facts(self) -> dict[str, str]:
+        """Commit, machine and versions, as the table has them."""
+        known = facts()
+        commit, machine = known.pop("commit"), known.pop("machine")
+        machine += f", {len(self.runs)} runs at once"
+        if self.arguments.device.type == "cuda":
+            machine += f" on {torch.cuda.get_device_name()}"
+        commit = self.arguments.commit or commit
+        return {"commit": commit, "machine": machine, "versions": json.dumps(known)}
 
     def learn(self) -> None:
         simulators = self.simulators
@@ -166,13 +177,7 @@ class ManyRuns:
 
     def save(self, status: str) -> None:
         """Write the whole table anew; until the last frame it says that runs were stopped."""
-        known = facts()
-        found = known.pop("commit")
-        own = {"commit": self.arguments.commit or found}
-        own["machine"] = f"{known.pop('machine')}, {len(self.runs)} runs at once"
-        if self.arguments.device.type == "cuda":
-            own["machine"] += f" on {torch.cuda.get_device_name()}"
-        own |= {"versions": json.dumps(known), "status": status}
+        own = self.facts | {"status": status}
         part = self.arguments.out.with_suffix(".part")
         with part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*COLUMNS, "entropy", "alpha", "value"])

@@ -11,8 +11,9 @@ import torch
 
 from torchrl_etl.modules.bundle import load_bundle
 
-from .learner import Learner, Settings, Shape
+from .learner import Learner
 from .returns import ReturnScales
+from .settings import Settings, Shape
 from .simulators import Simulators
 
 __all__ = ["Group"]
@@ -92,10 +93,10 @@ class Group:
     def store(self, simulators: Simulators) -> None:
         """Keep the step that was taken with the last actions."""
         reward, done = simulators.reward[self.rows], simulators.done[self.rows]
-        self.scales.see(reward, done)
+        self.scales.step(reward, done)
         told, width = self.told.numpy(), self.learner.width
         told[:, 0], told[:, 1] = reward, simulators.terminated[self.rows]
-        told[:, 2], told[:, 3] = done, self.scales.scale()
+        told[:, 2], told[:, 3] = done, self.scales.scale
         told[:, 4 : 4 + width] = simulators.following[self.rows, :width]
         with self._on_stream():
             self._show(simulators)

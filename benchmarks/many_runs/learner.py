@@ -8,59 +8,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from torchrl_etl.functional import categorical_mean, project_categorical
-from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
-from torchrl_etl.objectives import LeanSACLoss
+from torchrl_etl.functional import (
+    categorical_cross_entropy,
+    categorical_mean,
+    project_categorical,
+    reconstruction_loss,
+)
+from torchrl_etl.modules import RunningNorm, SynergyDecoder
+from torchrl_etl.training.stage import entropy_target
 
+from .initial import initial_weights
 from .networks import BatchNormBody, Mlp, ResidualBody, Stack
+from .settings import Settings, Shape
 
-__all__ = ["Learner", "Settings", "Shape"]
+__all__ = ["Learner"]
 
 SMALLEST_STD = 0.01
-
-
-@dataclass(frozen=True)
-class Shape:
-    """What all runs of a group have in common; the defaults are those of ``learner=residual``."""
-
-    body: Literal["residual", "batch_norm"] = "residual"
-    blocks: int = 2
-    actor: int = 64
-    critic: int = 96
-    num_critics: int = 2
-    bins: int = 101
-    bound: float = 5.0
-    batch_size: int = 256
-    updates: int = 1
-    lr: float = 3e-4
-    tau: float = 0.01
-    unit_rows: bool = False
-    normalize_observations: bool = True
-    learning_starts: int = 500
-    longest: int = 16
-    most_steps: int = 1
-    share: float = 0.9995
-    decoder_lr: float = 3e-5
-    anchor: float = 0.1
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a run can have for itself."""
-
-    gamma: float = 0.95
-    alpha_init: float = 0.01
-    action_std: float = 0.15
-    n_steps: int = 1
-    exponent: float = 2.0
-    uniform_frames: int = 0
 
 
 class Learner:
@@ -96,7 +64,7 @@ class Learner:
         self.emitted = decoders[0].synergy_dim if decoders else actions
         actors, critics = [], []
         for seed, own in zip(seeds, observations, strict=True):
-            actor, several = _initial(shape, seed, own, self.emitted, actions, self.width)
+            actor, several = initial_weights(shape, seed, own, self.emitted, actions, self.width)
             actors.append(actor)
             critics += several
         self.actor = self._stack(actors)
@@ -116,8 +84,8 @@ class Learner:
         def each(value: Callable[[Settings], float]) -> Tensor:  # [N, 1]
             return torch.tensor([[value(one)] for one in settings], device=device)
 
-        gaussian = math.sqrt(2 * math.pi * math.e)
-        self.entropy = each(lambda s: self.emitted * math.log(s.action_std * gaussian))
+        spec = Bounded(-1.0, 1.0, shape=(self.emitted,))
+        self.entropy = each(lambda s: entropy_target(spec, s.action_std))
         self.log_alpha = each(lambda s: math.log(s.alpha_init)).requires_grad_()
         self.gamma, self.steps = each(lambda s: s.gamma), each(lambda s: s.n_steps)
         self.uniform = each(lambda s: s.uniform_frames)
@@ -132,9 +100,7 @@ class Learner:
         sizes |= {"action": actions, "reward": 1, "terminated": 1, "done": 1}
         self.buffer = {name: zeros(frames, size) for name, size in sizes.items()}
         self.size = torch.zeros((), dtype=torch.long, device=device)
-        # Moments of the observations that were seen, as of torchrl_etl.modules.RunningNorm.
-        self.mean, self.squares = zeros(self.width).double(), zeros(self.width).double()
-        self.counted = torch.zeros((), dtype=torch.float64, device=device)
+        self.norm = RunningNorm(self.count * self.width).to(device)
         self.updates = torch.zeros((), device=device)
         # What simulators tell: reward, terminated, done, the scale of rewards, and what was seen
         # after the step and is seen now.
@@ -163,7 +129,7 @@ class Learner:
     def act(self) -> None:
         """Muscles [N, n] for what is seen now; noise is held for some steps."""
         self.seen.copy_(self.told[:, -self.width :])
-        self._count(self.seen)
+        self.norm.see(self.seen.view(1, -1))
         loc, scale = self._policy(self._normal(self.seen.unsqueeze(1)), self.actor.weights)
         fresh = (self.told[:, 2:3] > 0) | (self.left == 0)
         lengths = 1 + torch.searchsorted(self.chances, torch.rand_like(self.chances[:, :1]))
@@ -234,7 +200,7 @@ class Learner:
             atoms = batch["reward"].unsqueeze(-1) + batch["discount"].unsqueeze(-1) * shifted
             target = project_categorical(probabilities.softmax(-1), atoms, self.support)
         outputs = self._logits(self.critic.body, self.critic.weights, start, beside=end)
-        loss_critic = -(target.unsqueeze(1) * outputs.log_softmax(-1)).sum(-1).sum(1).mean(-1)
+        loss_critic = categorical_cross_entropy(outputs, target.unsqueeze(1)).sum(1).mean(-1)
 
         chosen = torch.cat([batch["observation"], self._decode(emitted)], -1)
         outputs = self._logits(self.critic.body, self.critic.weights.detach(), chosen)
@@ -243,8 +209,8 @@ class Learner:
         loss_alpha = -(self.log_alpha * (log_prob.detach() + self.entropy)).mean(-1)
         losses = loss_critic + loss_actor + loss_alpha
         if self.decoder is not None and self.shape.decoder_lr:
-            error = self._decode(batch["emitted"]) - batch["action"]
-            losses = losses + self.shape.anchor * error.square().mean((1, 2))
+            replayed = reconstruction_loss(self._decode(batch["emitted"]), batch["action"])
+            losses = losses + self.shape.anchor * replayed.mean(-1)
         logged = (-log_prob.mean(-1), alpha.squeeze(1), values.mean(-1))
         return losses, torch.stack([x.detach() for x in logged], 1)
 
@@ -307,20 +273,12 @@ class Learner:
         entries["reward"] = reward / self.told[:, 3:4]
         return entries | {"discount": discount * (1 - at("terminated", last))}
 
-    def _count(self, seen: Tensor) -> None:
-        self.counted += 1
-        shift = seen - self.mean
-        self.mean += shift / self.counted
-        self.squares += shift * (seen - self.mean)
-
     def _normal(self, observation: Tensor) -> Tensor:
-        """Observations [N, *, O] in deviations of those seen, if the shape says so."""
+        """Observations [N, *, O] in deviations of those seen by their run, if the shape says so."""
         if not self.shape.normalize_observations:
             return observation
-        variance = self.squares / self.counted.clamp(min=1)
-        deviation = torch.where(variance > 1e-12, variance, 1.0).sqrt()
-        shifted = observation - self.mean.float().unsqueeze(1)
-        return (shifted / deviation.float().unsqueeze(1)).clamp(-10, 10)
+        rows = observation.transpose(0, 1)
+        return self.norm(rows.flatten(1)).view(rows.shape).transpose(0, 1)
 
     @torch.no_grad()
     def constrain(self) -> None:
@@ -342,7 +300,7 @@ class Learner:
         """Make CUDA graphs of what a run does; whatever that changes is put back."""
         changed = [self.actor.weights, self.critic.weights, self.log_alpha, self.target]
         changed += [self.average, self.size, self.updates, self.told, self.noise, self.left]
-        changed += [self.mean, self.squares, self.counted]
+        changed += self.norm.buffers()
         for body in (self.actor.body, self.critic.body, self.target_body):
             changed += getattr(body, "running", [])
         if self.decoder is not None:
@@ -375,47 +333,3 @@ def _sampled(loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     normal = -noise.square() / 2 - scale.log() - math.log(2 * math.pi) / 2
     slope = 2 * (math.log(2) - raw - nn.functional.softplus(-2 * raw))
     return raw.tanh(), (normal - slope).sum(-1)
-
-
-def _initial(
-    shape: Shape, seed: int, observations: int, emitted: int, actions: int, width: int
-) -> tuple[list[Tensor], list[list[Tensor]]]:
-    """Weights of a run's actor and critics; what further observations would weigh is zero."""
-    torch.manual_seed(seed)
-    if shape.body == "batch_norm":
-        actor = BatchNormBody.initial(width, shape.actor, shape.blocks, 2 * emitted)
-        critics = [
-            BatchNormBody.initial(width + actions, shape.critic, shape.blocks, shape.bins)
-            for _ in range(shape.num_critics)
-        ]
-        return actor, critics
-    options = {"body": "residual", "layer_norm": True}
-    spec = Bounded(-1.0, 1.0, shape=(emitted,))
-    policy = make_actor(
-        {"observation": observations}, spec, hidden=[shape.actor] * shape.blocks, **options
-    )
-    value = make_critic(
-        {"observation": observations, "action": actions},
-        hidden=[shape.critic] * shape.blocks,
-        bins=shape.bins,
-        **options,
-    )
-    support = torch.linspace(-shape.bound, shape.bound, shape.bins)
-    loss = LeanSACLoss(
-        policy, value, action_spec=spec, num_qvalue_nets=shape.num_critics, support=support
-    )
-    missing = width - observations
-
-    def padded(weight: Tensor) -> Tensor:
-        own, rest = weight.split([observations, weight.shape[-1] - observations], -1)
-        return torch.cat([nn.functional.pad(own, (0, missing)), rest], -1)
-
-    def weights(name: str, module: nn.Module) -> list[Tensor]:
-        found = {k: w.detach() for k, w in loss._weights(name).items()}
-        order = [name for name, _ in module.named_parameters()]
-        first, *others = [found[name] for name in order]
-        return [padded(first), *others]
-
-    actor = weights("actor_network", policy)
-    stacked = weights("qvalue_network", value)
-    return actor, [[w[i] for w in stacked] for i in range(shape.num_critics)]

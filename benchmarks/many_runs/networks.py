@@ -6,7 +6,6 @@ All weights of a stack of N networks are one tensor [N, P]; a forward pass split
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +23,6 @@ def layer_norm(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return torch.addcmul(bias.unsqueeze(1), normal, weight.unsqueeze(1))
 
 
-@dataclass
 class Mlp:
     """The layers of the synergy decoder: ELUs between linear ones."""
 
@@ -35,11 +33,11 @@ class Mlp:
         return linear(x, *layers[-1])
 
 
-@dataclass
 class ResidualBody:
     """The layers of ``torchrl_etl.modules.make_layers("residual")``."""
 
-    blocks: int
+    def __init__(self, blocks: int) -> None:
+        self.blocks = blocks
 
     def __call__(self, x: Tensor, weights: Iterator[Tensor], training: bool) -> Tensor:
         w = weights.__next__

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from torchrl_etl.modules.running_moments import RunningMoments
 
 __all__ = ["ReturnScales"]
 
 
-class ReturnScales:
+class ReturnScales(RunningMoments):
     """Of N runs with discount factors ``gammas`` [N]."""
 
     def __init__(self, gammas: np.ndarray, bound: float) -> None:
-        self.gammas, self.bound, self.count = gammas, bound, 0
-        self.sums, self.mean, self.squares, self.largest = np.zeros((4, len(gammas)))
+        super().__init__((len(gammas),))
+        self.gammas, self.bound = gammas, bound
+        self.sums, self.largest = np.zeros((2, len(gammas)))
 
-    def see(self, reward: np.ndarray, done: np.ndarray) -> None:
+    def step(self, reward: np.ndarray, done: np.ndarray) -> None:
+        """See a step of every run [N]."""
         returns = reward + self.gammas * self.sums
         self.sums = np.where(done, 0.0, returns)
-        self.count += 1
-        shift = returns - self.mean
-        self.mean = self.mean + shift / self.count
-        self.squares = self.squares + shift * (returns - self.mean)
+        self.see(torch.from_numpy(returns))
         self.largest = np.maximum(self.largest, np.abs(returns))
 
+    @property
     def scale(self) -> np.ndarray:
-        deviation = np.sqrt(self.squares / max(self.count, 1))
-        scale = np.maximum(deviation, self.largest / self.bound)
+        scale = np.maximum(self.variance.sqrt().numpy(), self.largest / self.bound)
         return np.where(scale > 1e-8, scale, 1.0)
