@@ -1,0 +1,85 @@
+"""Synergies of a policy that has learned a task: what explored ones could be at best.
+
+    python benchmarks/learned_synergies.py runs/SAC_RUN learned/hand_pose --num-synergies 8
+
+Takes the averaged actor of a run of plain SAC, lets it act with its noise, and fits a GMVAE on the
+mean actions in the states that it meets. The bundle that this leaves starts stage 2 as any other
+(``synergies=learned/hand_pose``), on the same task or on another one of the same muscles; its
+facts say how good the policy was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_etl.analysis import variance_accounted_for
+from torchrl_etl.command_line import quiet_torchrl
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.synergy_report import fit_gmvae
+
+EPISODES = 50
+UPDATES = 4000
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--num-synergies", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    quiet_torchrl()
+    torch.manual_seed(arguments.seed)
+
+    config = resumed_config(arguments.run, ["evaluation.episodes=1"])
+    if config.method.learner != "sac":
+        parser.error(f"{arguments.run} is a run of {config.method.name}; pass one of method=sac.")
+    experiment = Experiment(config, resume=arguments.run)
+    stage = experiment.learned()
+    found = experiment.evaluator(stage)().mean_return.mean
+    env, actions = experiment.evaluation_env(stage), []
+    env.set_seed(arguments.seed)
+    with torch.no_grad():
+        for _ in range(EPISODES):
+            with set_exploration_type(ExplorationType.RANDOM):
+                rollout = env.rollout(1000, stage.trained_policy)
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                actions.append(stage.trained_policy(rollout.select("observation"))["action"])
+    shown = torch.cat(actions)
+
+    gmvae = GMVAE.from_spec(
+        experiment.spec.full_action_spec_unbatched["action"],
+        arguments.num_synergies,
+        num_components=arguments.num_synergies,
+        hidden=config.explore.gmvae.hidden,
+    )
+    fit_gmvae(gmvae, shown, updates=UPDATES)
+    known = {
+        "vaf": variance_accounted_for(shown, gmvae.reconstruct(shown).detach()),
+        "return_of_policy": found,
+        "frames": 0,  # nothing is charged: this is a bound
+        **facts(),
+    }
+    save_bundle(
+        SynergyDecoder.from_gmvae(gmvae, shown),
+        arguments.out,
+        task=experiment.task.env_id,
+        actuators=experiment.actuators,
+        num_components=gmvae.num_components,
+        facts=known,
+    )
+    print(json.dumps(known))
+
+
+if __name__ == "__main__":
+    main()
