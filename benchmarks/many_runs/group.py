@@ -49,7 +49,7 @@ class Group:
         settings = [Settings(**run.get("settings", {})) for run in self.runs]
         decoders = None
         if "synergies" in self.runs[0]:
-            residual = described.get("residual", 0.5)
+            residual = described.get("residual", 1.0)
             decoders = [load_bundle(run["synergies"], residual=residual)[0] for run in self.runs]
         # The seed of stage 2, see torchrl_etl.training.experiment.
         seeds = [2 * run["seed"] + 1 for run in self.runs]

@@ -38,7 +38,7 @@ class Settings:
     """What a run can have for itself."""
 
     gamma: float = 0.95
-    alpha_init: float = 0.01
+    alpha_init: float = 5e-4
     action_std: float = 0.15
     n_steps: int = 1
     exponent: float = 2.0
