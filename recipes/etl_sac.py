@@ -27,6 +27,13 @@ from torchrl_etl.envs import SimulationError
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
 
 CONF = Path(__file__).parent / "conf"
+SYNERGIES = (
+    ("vaf", "variance accounted for"),
+    ("pca_vaf", "PCA"),
+    ("nmf_vaf", "NMF"),
+    ("control_authority", "control authority"),
+    ("direction_alignment", "alignment with directions"),
+)
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
@@ -52,14 +59,12 @@ def main(config: DictConfig) -> None:
 
 def report(summary: dict[str, Any], folder: Path) -> str:
     """What a person wants to know at the end of a run."""
-    synergies, learned = summary.get("synergies"), summary.get("learn", {})
+    synergies, learned = summary.get("synergies", {}), summary.get("learn", {})
     lines = ["", f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}"]
-    if synergies is not None:
-        lines.append(
-            f"  {'synergies':<12}variance accounted for {synergies['vaf']:.3f} (PCA "
-            f"{synergies['pca_vaf']:.3f}, NMF {synergies['nmf_vaf']:.3f}), "
-            f"control authority {synergies['control_authority']:.2f}"
-        )
+    # A bundle from elsewhere holds what whoever saved it chose to.
+    known = [f"{words} {synergies[key]:.2f}" for key, words in SYNERGIES if key in synergies]
+    if known:
+        lines.append(f"  {'synergies':<12}{', '.join(known)}")
     for key in ("return", "solved", "solved_time"):
         if key in learned:
             value = learned[key]

@@ -10,6 +10,7 @@ from torch import nn
 from torchrl_etl.analysis.diagnostics import (
     MixtureUsage,
     control_authority,
+    direction_alignment,
     mixture_usage,
     nmf_vaf,
     pca_vaf,
@@ -130,6 +131,16 @@ def test_mixture_usage_tells_an_even_mixture_from_a_collapsed_one():
     assert even.effective == pytest.approx(4.0, abs=1e-4)
     torch.testing.assert_close(collapsed.shares, torch.tensor([0.0, 0.0, 1.0, 0.0]))
     assert collapsed.effective == pytest.approx(1.0, abs=1e-4)
+
+
+def test_alignment_by_hand():
+    along = torch.tensor([[3.0, 0.0], [-1.0, 0.0], [1.0, 2.0], [1.0, -2.0]])  # around (1, 0)
+    ways = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    assert direction_alignment(along, ways) == pytest.approx((1 + 1 + 0 - 1) / 4)
+    assert direction_alignment(7 - along, ways) == pytest.approx(-1 / 4)
+    assert direction_alignment(torch.ones(3, 2), ways[:3]) == 0.0  # nothing moved
+    with pytest.raises(ValueError, match=r"\[4, 2\] and direction \[3, 2\]"):
+        direction_alignment(along, ways[:3])
 
 
 def test_each_fault_gets_its_own_sentence_with_its_numbers():

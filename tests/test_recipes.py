@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.configs import ROOT, TINY
+from torchrl_etl.modules.bundle import load_bundle, save_bundle
 
 SMALL = [override for override in TINY if not override.startswith("env=")]
 
@@ -42,7 +43,13 @@ def hand(tmp_path_factory) -> Path:
         cwd=folder.parent,
     )
     assert done.returncode == 0, done.stderr
-    for word in ("variance accounted for", "before", "solved", str(folder / "pictures")):
+    for word in (
+        "variance accounted for",
+        "alignment",
+        "before",
+        "solved",
+        str(folder / "pictures"),
+    ):
         assert word in done.stdout
     return folder
 
@@ -97,12 +104,14 @@ def test_evaluate_draws_a_video_or_says_what_to_install(hand):
 
 @pytest.mark.slow
 def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
+    decoder, info = load_bundle(hand)  # saved again, as anybody can, without a fact about it
+    bundle = save_bundle(decoder, tmp_path / "own", task=info.task, actuators=info.actuators)
     done = run(
         "etl_sac.py",
         *SMALL,
         "env=myoHandKeyTurn",
         "stage=learn",
-        f"synergies='{hand}'",
+        f"synergies='{bundle}'",
         f"run_dir='{tmp_path}/run'",
         cwd=tmp_path,
     )

@@ -3,6 +3,7 @@
 from torchrl_etl.analysis.diagnostics import (
     MixtureUsage,
     control_authority,
+    direction_alignment,
     mixture_usage,
     nmf_vaf,
     pca_vaf,
@@ -17,6 +18,7 @@ __all__ = [
     "Interval",
     "MixtureUsage",
     "control_authority",
+    "direction_alignment",
     "embedding",
     "interval",
     "learning_curves",

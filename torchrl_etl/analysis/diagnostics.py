@@ -19,6 +19,7 @@ __all__ = [
     "MixtureUsage",
     "as_matrix",
     "control_authority",
+    "direction_alignment",
     "mixture_usage",
     "nmf_vaf",
     "pca_vaf",
@@ -231,6 +232,35 @@ def mixture_usage(gmvae: GMVAE, actions: Tensor) -> MixtureUsage:
     shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
     shares = shares / len(actions)
     return MixtureUsage(shares, torch.special.entr(shares).sum().exp().item())
+
+
+def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | ArrayLike) -> float:
+    """Whether episodes went where their directions point: mean cosine between φ(s) - mean φ and z.
+
+    Near 0 the policy does not heed its direction, and exploration is undirected; 1 is the most
+    there can be. With few episodes it scatters around 0 by 1 / √(episodes · d).
+
+    Args:
+        embedding (Tensor or array): φ of the states that were visited [N, d].
+        direction (Tensor or array): direction of the episode that each belongs to [N, d].
+
+    Examples:
+        >>> import torch
+        >>> direction = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+        >>> round(direction_alignment(5.0 + 2.0 * direction, direction), 6)
+        1.0
+        >>> round(direction_alignment(torch.tensor([[0.0, 1.0], [0.0, -1.0]]), direction), 6)
+        0.0
+    """
+    place = as_matrix(embedding, "embedding")
+    place, way = place - place.mean(0), as_matrix(direction, "direction")
+    if place.shape != way.shape:
+        raise ValueError(
+            f"embedding is {list(place.shape)} and direction {list(way.shape)}; pass a direction "
+            "for each embedding, of the same size."
+        )
+    lengths = np.linalg.norm(place, axis=1) * np.linalg.norm(way, axis=1)
+    return float(np.mean((place * way).sum(1) / np.maximum(lengths, 1e-12)))
 
 
 def synergy_warnings(

@@ -133,7 +133,7 @@ class Experiment:
         torch.manual_seed(stage.seed)  # finishing gives the same whether or not it was resumed
         decoder = stage.finish(stop.check)
         numbers, warnings = describe_synergies(stage.gmvae, decoder, stage.actions())
-        numbers["frames"] = stage.frames
+        numbers |= {"direction_alignment": stage.alignment(), "frames": stage.frames}
         for warning in warnings:
             self.say(f"Warning: {warning}")
         if self.config.pictures:

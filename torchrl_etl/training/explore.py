@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_etl.analysis import direction_alignment
 from torchrl_etl.modules import (
     GMVAE,
     GaussianDynamics,
@@ -204,6 +205,13 @@ class ExploreStage(Stage):
     def actions(self, count: int = 20_000) -> Tensor:
         """Up to ``count`` of the latest actions shown to the GMVAE, [N, n]."""
         return self.newest(count)["shown_action"]
+
+    @torch.no_grad()
+    def alignment(self, count: int = 20_000) -> float:
+        """:func:`~torchrl_etl.analysis.direction_alignment` of the latest states."""
+        rows = self.newest(count)
+        reached = self.encoder(rows["next", "observation"].to(self.device))
+        return direction_alignment(reached, rows["direction"])
 
     def parts(self) -> dict[str, Any]:
         return {
