@@ -105,18 +105,35 @@ def test_directions_are_unit_vectors_kept_through_the_episode():
     stage.close()
 
 
-@pytest.mark.parametrize("actions", ["mean", "sampled"])
+@pytest.mark.parametrize("actions", ["policy", "mean", "sampled"])
 def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
-    stage = explore_stage(f"explore.fit.actions={actions}")
+    stage = explore_stage(f"explore.fit.actions={actions}", "explore.redraw=0")
     batch = stage.collect()
-    shown = stage.buffer.storage[:]["shown_action"]
-    expected = batch["action"] if actions == "sampled" else torch.tanh(batch["loc"])
-    torch.testing.assert_close(shown, expected, atol=1e-5, rtol=1e-5)
+    with torch.no_grad():  # as learning would
+        for parameter in stage.policy.parameters():
+            parameter.mul_(1.5)
+        now = stage.policy(batch.select("observation", "direction"))["loc"]
+    expected = {"policy": now.tanh(), "mean": batch["loc"].tanh(), "sampled": batch["action"]}
+    torch.testing.assert_close(stage.actions(), expected[actions], atol=1e-5, rtol=1e-5)
+    stage.close()
+
+
+def test_an_update_learns_for_directions_that_nobody_followed():
+    stage = explore_stage()
+    fill(stage)
+    followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
+    drawn = {tuple(row) for row in stage.buffer.sample()["direction"].tolist()}
+    assert not followed & drawn
+    stage.close()
+    stage = explore_stage("explore.redraw=0")
+    fill(stage)
+    followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
+    assert {tuple(row) for row in stage.buffer.sample()["direction"].tolist()} <= followed
     stage.close()
 
 
 def test_the_better_share_is_the_better_rewarded_one():
-    stage = explore_stage("explore.fit.best_share=0.25")
+    stage = explore_stage("explore.fit.best_share=0.25", "explore.fit.actions=mean")
     fill(stage)
     batch = stage.buffer.sample()
     best = stage._best(batch)["action"]

@@ -23,7 +23,7 @@ _CHOICES = {
     "collector.kind": COLLECTORS,
     "method.learner": ("etl", *METHODS),
     "stage": ("explore", "learn", "all"),
-    "explore.fit.actions": ("mean", "sampled", "activation"),
+    "explore.fit.actions": ("policy", "mean", "sampled", "activation"),
     "explore.representation": ("metric", "metra"),
     "explore.buffer_storage": ("memory", "memmap"),
     "learn.buffer_storage": ("memory", "memmap"),
@@ -155,7 +155,7 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a share in [0, 1]",
         lambda v: _real(v) and 0 <= v <= 1,
-        ("learn.residual", "learn.sac.lr_end"),
+        ("explore.redraw", "learn.residual", "learn.sac.lr_end"),
     ),
     (
         "a share in [0, 1)",

@@ -34,11 +34,11 @@ from torchrl_etl.training.stage import (
     make_optimizer,
     ready_for_training,
 )
-from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward
+from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, RedrawDirection
 
 __all__ = ["ExploreStage"]
 
-GMVAEActions = Literal["mean", "sampled", "activation"]
+GMVAEActions = Literal["policy", "mean", "sampled", "activation"]
 
 
 class ExploreStage(Stage):
@@ -48,10 +48,12 @@ class ExploreStage(Stage):
     it then is; SAC learns on the bonus, the encoder on the behavioral metric with the task's own
     reward, and the GMVAE on the batch's actions.
 
-    Deviates: the GMVAE sees the exploration policy's mean actions (``actions="mean"``), since
-    actions sampled from a maximum-entropy policy are nearly white noise that few synergies
-    cannot explain; ``"sampled"`` is the print. After the last frame the GMVAE is trained on for
-    ``final_updates`` (Algorithm 1 stops with the last frame: 0).
+    Deviates: batches get directions drawn anew (``redraw=1``), without which some thousand frames
+    lead nowhere in particular; 0 is the print. The GMVAE sees the mean actions of the policy as it
+    is (``actions="policy"``) or was when it acted (``"mean"``), since actions sampled from a
+    maximum-entropy policy are nearly white noise that few synergies cannot explain; ``"sampled"``
+    is the print. After the last frame the GMVAE is trained on for ``final_updates`` (Algorithm 1
+    stops with the last frame: 0).
 
     Args:
         make_base_env (callable): environment to which the direction is added.
@@ -67,7 +69,8 @@ class ExploreStage(Stage):
             :class:`~torchrl_etl.objectives.BehavioralMetricLoss`,
             :class:`~torchrl_etl.modules.GMVAE`, and of SAC (``gamma``, ``tau``, ``lr``,
             ``alpha_init``, ``action_std``).
-        fit (mapping): how the GMVAE is trained: ``actions`` ("mean", "sampled" or
+        redraw (float): ``share`` of :class:`~torchrl_etl.transforms.RedrawDirection`.
+        fit (mapping): how the GMVAE is trained: ``actions`` ("policy", "mean", "sampled" or
             "activation"), ``best_share`` (share of each batch, by task reward, that it sees),
             ``lr``, ``kl_weight``, ``component_kl_weight``, ``final_updates``.
         representation (str): "metric" trains φ on the behavioral metric, "metra" on the bonus under
@@ -90,6 +93,7 @@ class ExploreStage(Stage):
         encoder_lr: float,
         encoder_tau: float,
         direction: Mapping[str, Any],
+        redraw: float,
         bonus: Mapping[str, Any],
         representation: Literal["metric", "metra"],
         metric: Mapping[str, Any],
@@ -111,7 +115,7 @@ class ExploreStage(Stage):
         self.gmvae = GMVAE.from_spec(action_spec, num_synergies, **gmvae).to(device)
 
         make_primer = partial(DirectionPrimer, encoder["embedding_dim"], **direction)
-        make_primer()  # objects to its arguments now
+        self.redraw = RedrawDirection(make_primer(), share=redraw)
         super().__init__(
             lambda: make_base_env().append_transform(make_primer()),
             policy,
@@ -119,7 +123,7 @@ class ExploreStage(Stage):
             **stage,
         )
         self.bonus = IntrinsicReward(self.encoder, **bonus)
-        self.buffer.append_transform(self.bonus)
+        self.buffer.append_transform(self.redraw).append_transform(self.bonus)
 
         self.sac = LeanSACLoss(
             policy,
@@ -153,17 +157,16 @@ class ExploreStage(Stage):
         self.gmvae_loss = GMVAELoss(self.gmvae, **fit)
 
     def transitions(self, batch: TensorDictBase) -> TensorDictBase:
-        match self.fit_actions:
-            case "mean":
-                shown = self.policy.build_dist_from_params(batch).deterministic_sample
-            case "sampled":
-                shown = batch["action"]
-            case "activation":
-                shown = batch["next", "activation"]
         kept = batch.select("observation", "direction", "action", ("next", "observation"))
         kept["next"].update(batch["next"].select("direction", "done", "terminated"))
         kept["next", "reward"] = self.reward_scale * batch["next", "reward"]
-        return kept.set("shown_action", shown)
+        match self.fit_actions:
+            case "mean":
+                shown = self.policy.build_dist_from_params(batch).deterministic_sample
+                kept["shown_action"] = shown
+            case "activation":
+                kept["shown_action"] = batch["next", "activation"]
+        return kept
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         out = self.sac(batch)
@@ -172,9 +175,20 @@ class ExploreStage(Stage):
         # ("next", "intrinsic_reward") appeared as the batch was drawn, from today's φ.
         return loss, out.set("intrinsic_reward", batch["next", "intrinsic_reward"].mean())
 
+    @torch.no_grad()
+    def _shown(self, batch: TensorDictBase) -> Tensor:
+        """The actions [N, n] of a batch that the GMVAE sees."""
+        match self.fit_actions:
+            case "policy":
+                inputs = batch.select(*self.policy.in_keys)
+                return self.policy.get_dist(inputs).deterministic_sample
+            case "sampled":
+                return batch["action"]
+        return batch["shown_action"]
+
     def _best(self, batch: TensorDictBase) -> TensorDictBase:
         """The better-rewarded share of a batch, as what the GMVAE sees."""
-        actions = batch["shown_action"]
+        actions = self._shown(batch)
         if self.best_share < 1:
             count = max(1, round(self.best_share * len(actions)))
             actions = actions[batch["next", "reward"].squeeze(-1).topk(count).indices]
@@ -204,7 +218,7 @@ class ExploreStage(Stage):
 
     def actions(self, count: int = 20_000) -> Tensor:
         """Up to ``count`` of the latest actions shown to the GMVAE, [N, n]."""
-        return self.newest(count)["shown_action"]
+        return self._shown(self.redraw(self.newest(count)).to(self.device))
 
     @torch.no_grad()
     def alignment(self, count: int = 20_000) -> float:

@@ -1,0 +1,103 @@
+"""Directions of sampled transitions, drawn anew."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, TransformedEnv
+
+from tests.point_env import PointEnv
+from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, RedrawDirection
+
+K = 3
+
+
+def transitions(*size, key="direction"):
+    torch.manual_seed(0)
+    followed = torch.zeros(*size, K)
+    followed[..., 0] = 1.0
+    ends = [TensorDict({"observation": torch.randn(*size, K)}, size) for _ in range(2)]
+    for end in ends:
+        end[key] = followed
+    return ends[0].set("next", ends[1])
+
+
+def spread(directions):
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(directions.shape[:-1]))
+    return len({tuple(row) for row in directions.reshape(-1, K).tolist()})
+
+
+@pytest.mark.parametrize("size", [(), (40,), (4, 10)])
+def test_both_ends_get_the_same_new_unit_vector(size):
+    batch = RedrawDirection(DirectionPrimer(K))(transitions(*size))
+    assert spread(batch["direction"]) == max(1, torch.Size(size).numel())
+    assert torch.equal(batch["direction"], batch["next", "direction"])
+    assert not torch.equal(batch["direction"], transitions(*size)["direction"])
+
+
+def test_the_share_is_a_probability_and_zero_is_the_print():
+    batch = transitions(2000)
+    kept = RedrawDirection(DirectionPrimer(K), share=0.0)(batch.clone())
+    assert (kept == batch).all()
+    some = RedrawDirection(DirectionPrimer(K), share=0.25)(batch.clone())
+    redrawn = (some["direction"] != batch["direction"]).any(-1).float().mean()
+    assert redrawn.item() == pytest.approx(0.25, abs=0.04)
+
+
+def test_new_directions_are_the_primer_s():
+    primer = DirectionPrimer(K, kind="orthonormal", num_directions=2)
+    drawn = RedrawDirection(primer)(transitions(200))["direction"]
+    assert {tuple(row) for row in drawn.tolist()} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
+
+
+def test_keys_may_be_nested():
+    key = ("agent", "direction")
+    redraw = RedrawDirection(DirectionPrimer(K, out_key=key))
+    batch = redraw(transitions(20, key=key))
+    assert spread(batch[key]) == 20
+    assert torch.equal(batch[key], batch["next", "agent", "direction"])
+
+
+def test_a_buffer_keeps_what_was_followed_and_the_bonus_is_of_what_was_drawn():
+    encoder = TensorDictModule(nn.Linear(K, K), in_keys=["observation"], out_keys=["embedding"])
+    bonus = IntrinsicReward(encoder, normalize=False)
+    both = Compose(RedrawDirection(DirectionPrimer(K)), bonus)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=30, transform=both)
+    stored = transitions(50)
+    buffer.extend(stored)
+    for _ in range(2):
+        batch = buffer.sample()
+        assert spread(batch["direction"]) == 30
+        moved = encoder.module(batch["next", "observation"]) - encoder.module(batch["observation"])
+        expected = (moved * batch["direction"]).sum(-1, keepdim=True)
+        torch.testing.assert_close(batch["next", "intrinsic_reward"], expected)
+    assert torch.equal(buffer.storage[:]["direction"], stored["direction"])
+
+
+def test_it_stands_in_a_sequence_of_modules_and_can_be_cloned():
+    redraw = RedrawDirection(DirectionPrimer(K), share=0.5)
+    model = nn.Sequential(redraw, redraw.clone())
+    assert spread(model(transitions(30))["direction"]) > 10
+    assert redraw.clone().share == 0.5
+    redraw.load_state_dict(RedrawDirection(DirectionPrimer(K)).state_dict())
+
+
+def test_draws_follow_torch_s_seed():
+    redraw = RedrawDirection(DirectionPrimer(K))
+    first, second = (redraw(transitions(9))["direction"] for _ in range(2))
+    assert torch.equal(first, second)  # transitions() seeds
+
+
+def test_misuse_is_one_sentence():
+    with pytest.raises(ValueError, match=r"share is 1.5.*\[0, 1\]"):
+        RedrawDirection(DirectionPrimer(K), share=1.5)
+    redraw = RedrawDirection(DirectionPrimer(K))
+    with pytest.raises(KeyError, match="both ends of a transition"):
+        redraw(transitions(4).exclude(("next", "direction")))
+    env = TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), redraw.clone()))
+    with pytest.raises(NotImplementedError, match="append it to a replay buffer"):
+        env.rollout(2)

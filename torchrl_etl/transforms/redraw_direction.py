@@ -1,0 +1,79 @@
+"""Other directions for transitions that have been collected."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import expand_as_right, unravel_key
+from torchrl.envs.transforms import Transform
+
+from torchrl_etl.transforms.direction import DirectionPrimer
+
+__all__ = ["RedrawDirection"]
+
+
+class RedrawDirection(Transform):
+    """Draws the directions of sampled transitions anew.
+
+    Eq. 1 rewards any transition along any direction, so an off-policy learner can ask of each what
+    it would have been worth to an episode that went another way, as hindsight replay asks of
+    goals. A few thousand frames hold some dozens of directions, and every transition is then worth
+    one for all of them.
+
+    Goes on a replay buffer before :class:`IntrinsicReward`, or is called on a tensordict of
+    transitions, of any batch size. What the buffer holds is not changed.
+
+    Deviates: Algorithm 1 learns from the direction that was followed; ``share=0`` is the print.
+
+    Args:
+        primer (DirectionPrimer): says which directions there are, and under which key.
+
+    Keyword Args:
+        share (float): probability that a transition gets a new direction, in [0, 1]. Default: 1.
+
+    Keys:
+        rewrites ``direction`` [*, k] and ``("next", "direction")``, both alike.
+
+    Raises:
+        ValueError: if the share lies outside of [0, 1].
+        NotImplementedError: in an environment, where :class:`DirectionPrimer` is the one that
+            draws.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.transforms import DirectionPrimer, RedrawDirection
+        >>> primer = DirectionPrimer(2, kind="orthonormal", num_directions=1)
+        >>> followed = torch.tensor([[0.0, 1.0]])
+        >>> step = TensorDict({"direction": followed, "next": {"direction": followed}}, [1])
+        >>> RedrawDirection(primer)(step)["next", "direction"]
+        tensor([[1., 0.]])
+    """
+
+    def __init__(self, primer: DirectionPrimer, *, share: float = 1.0) -> None:
+        if not 0 <= share <= 1:
+            raise ValueError(
+                f"share is {share!r}; it is the probability that a transition gets a new "
+                "direction and must lie in [0, 1]."
+            )
+        super().__init__(in_keys=primer.out_keys, out_keys=primer.out_keys)
+        self.primer, self.share = primer, share
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        (key,) = self.in_keys
+        followed = tensordict.get(key)
+        if followed is None or tensordict.get(unravel_key(("next", key)), None) is None:
+            raise KeyError(
+                f"RedrawDirection reads {key!r} at both ends of a transition; beside what is "
+                f"missing are {sorted(map(str, tensordict.keys(True, True)))}."
+            )
+        drawn = self.primer.draw(tensordict.batch_size, followed.device)
+        again = torch.rand(tensordict.batch_size, device=followed.device) < self.share
+        direction = torch.where(expand_as_right(again, drawn), drawn, followed)
+        return tensordict.set(key, direction).set(unravel_key(("next", key)), direction.clone())
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise NotImplementedError(
+            "RedrawDirection is for transitions that are sampled: append it to a replay buffer; "
+            "in an environment DirectionPrimer draws directions."
+        )
