@@ -106,10 +106,11 @@ def test_the_paper_preset_reaches_the_parts_it_is_about():
     paper.update()
     assert paper.bonus.deviation is None
     assert paper.metric.regularizer == "literal"
+    assert paper.redraw.share == 0
     direction = paper.buffer.storage[:]["direction"]
     assert ((direction == 0) | (direction == 1)).all()
     kept = paper.buffer.storage[:]
-    torch.testing.assert_close(kept["shown_action"], kept["action"])
+    torch.testing.assert_close(paper.actions(), kept["action"])
 
 
 def test_embedding_size_follows_the_synergies_unless_given():
