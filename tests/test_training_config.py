@@ -48,6 +48,8 @@ def test_every_task_of_the_paper_is_valid(task):
         ("collector.frames_per_batch=33", "it must be a multiple of their number"),
         ("checkpoint.keep=1", "checkpoint.keep is 1; it must be a whole number above 1"),
         ("explore.fit.best_share=0", "explore.fit.best_share is 0; it must be a share in (0, 1]"),
+        ("explore.fit.best_share=0.5", "use explore.fit.actions=mean"),
+        ("explore.redraw=2", "explore.redraw is 2; it must be a share in [0, 1]"),
         ("explore.fit.actions=loc", "policy, mean, sampled, activation"),
         ("learn.fine_tuning=freeze", "nearest: frozen"),
         ("learn.residual=2", "learn.residual is 2; it must be a share in [0, 1]"),

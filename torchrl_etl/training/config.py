@@ -207,6 +207,12 @@ def validate(config: DictConfig) -> None:
             f"learn.critic.bins is {config.learn.critic.bins}, which needs a bound on returns; "
             "give learn.sac.return_bound=5 or the like."
         )
+    fit = config.explore.fit
+    if fit.best_share < 1 and fit.actions == "policy":
+        raise ValueError(
+            f"explore.fit.best_share is {fit.best_share}, a share by reward, but the actions of "
+            "explore.fit.actions=policy are such as nobody took; use explore.fit.actions=mean."
+        )
     if config.stage == "learn" and config.synergies is None:
         raise ValueError(
             "stage=learn needs synergies=PATH, the run folder or bundle of an earlier exploration; "
