@@ -37,7 +37,7 @@ def test_stage_1_finds_actions_in_the_subspace_that_moves_the_joints(basis):
     actions = stage.actions(1500)
     deviation = actions - actions.mean(0)
     share = (deviation @ basis.T).square().sum() / deviation.square().sum()
-    assert share > 3 * 2 / 16  # actions without direction have 2/16 of their variance there
+    assert share > 4 * 2 / 16  # actions without direction have 2/16 of their variance there
 
 
 @pytest.mark.slow
