@@ -61,7 +61,7 @@ class RedrawDirection(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (key,) = self.in_keys
-        followed = tensordict.get(key)
+        followed = tensordict.get(key, None)
         if followed is None or tensordict.get(unravel_key(("next", key)), None) is None:
             raise KeyError(
                 f"RedrawDirection reads {key!r} at both ends of a transition; beside what is "
