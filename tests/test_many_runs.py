@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
+from benchmarks.many_runs.group import EXPLORED, Group
 from benchmarks.many_runs.learner import Learner
 from benchmarks.many_runs.returns import ReturnScales
 from benchmarks.many_runs.settings import Settings, Shape
@@ -147,6 +148,30 @@ def test_targets_of_three_steps_by_hand():
         ends = last % 5 == 4
         assert batch["discount"][1, i].item() == pytest.approx(0.0 if ends else 0.95**3)
         assert batch["following"][0, i, 0] == batch["observation"][0, i, 0]
+
+
+def test_what_was_explored_is_given_as_in_the_recipe(tmp_path):
+    options = ("learn.reuse_exploration=true", "learn.reward_scale=1", "frames=601")
+    experiment = Experiment(tiny(*options, f"run_dir='{tmp_path}/run'"))
+    experiment.run()
+    run = {"seed": 0, "synergies": tmp_path / "run" / "synergies"}
+    shape = {"actor": 8, "critic": 8, "batch_size": 5}
+    muscles = experiment.spec.full_action_spec_unbatched["action"].shape[-1]
+    sees = experiment.spec.observation_spec["observation"].shape[-1]
+    described = {"reuse": True, "shape": shape, "runs": [run]}
+    group = Group(described, slice(0, 1), [sees], muscles, 40, CPU)
+    stage = experiment.learn_stage(experiment._decoder()[0])
+    stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
+    rows = stage.buffer.storage[:600].flatten_keys(".")
+    for name, key in EXPLORED.items():
+        torch.testing.assert_close(group.learner.buffer[name][0, :600], rows[key].float())
+    assert group.owed == group.learner.size == 600
+    seen = torch.rand(1, sees)
+    norm = RunningNorm(sees)
+    norm.see(rows["observation"])  # as LearnStage does with normalized observations
+    torch.testing.assert_close(group.learner.norm(seen), norm(seen))
+    group.update()
+    assert group.owed == 0 and group.learner.updates == 601
 
 
 @pytest.mark.parametrize("body", ["residual", "batch_norm"])

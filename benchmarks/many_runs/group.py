@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
 
 from torchrl_etl.modules.bundle import load_bundle
 
@@ -17,6 +20,17 @@ from .settings import Settings, Shape
 from .simulators import Simulators
 
 __all__ = ["Group"]
+
+# Columns of the learner's buffer, and what they are called in what stage 1 left.
+EXPLORED = {
+    "observation": "observation",
+    "following": "next.observation",
+    "emitted": "synergy",
+    "action": "action",
+    "reward": "next.reward",
+    "terminated": "next.terminated",
+    "done": "next.done",
+}
 
 
 class Group:
@@ -53,9 +67,17 @@ class Group:
             decoders = [load_bundle(run["synergies"], residual=residual)[0] for run in self.runs]
         # The seed of stage 2, see torchrl_etl.training.experiment.
         seeds = [2 * run["seed"] + 1 for run in self.runs]
+        given = explored(self.runs, max(observations)) if described.get("reuse") else None
+        self.owed = 0  # updates for what is given, made up for as soon as learning starts
+        room = frames
+        if given is not None:
+            room += (count := given["reward"].shape[1])
+            self.owed = count * self.shape.updates
         self.learner = Learner(
-            self.shape, settings, seeds, observations, actions, decoders, frames, device
+            self.shape, settings, seeds, observations, actions, decoders, room, device
         )
+        if given is not None:
+            self.learner.give(given)
         torch.manual_seed(seeds[0])
         self.scales = ReturnScales(np.array([s.gamma for s in settings]), self.shape.bound)
         self.told = torch.zeros(self.learner.told.shape)
@@ -65,7 +87,7 @@ class Group:
         if device.type == "cuda":
             self.told, self.moved = self.told.pin_memory(), self.moved.pin_memory()
             self.stream = torch.cuda.Stream()
-            self.event = torch.cuda.Event(blocking=True)  # the wait is asleep: others need cores
+            self.event = torch.cuda.Event()
             torch.cuda.synchronize()
 
     def _on_stream(self) -> AbstractContextManager:
@@ -87,8 +109,9 @@ class Group:
 
     def update(self) -> None:
         with self._on_stream():
-            for _ in range(self.shape.updates):
+            for _ in range(self.shape.updates + self.owed):
                 self.learner.update()
+        self.owed = 0
 
     def store(self, simulators: Simulators) -> None:
         """Keep the step that was taken with the last actions."""
@@ -111,3 +134,21 @@ class Group:
         width = self.learner.width
         self.told.numpy()[:, -width:] = simulators.observation[self.rows, :width]
         self.learner.told.copy_(self.told, non_blocking=True)
+
+
+def explored(runs: Sequence[Mapping[str, Any]], width: int) -> dict[str, Tensor]:
+    """What stage 1 left beside the synergies of each run, as rows of the learner's buffer.
+
+    As in :meth:`torchrl_etl.training.learn.LearnStage.take`.
+    """
+    padded: dict[str, list[Tensor]] = {}
+    for run in runs:
+        rows = load_file(Path(run["synergies"]).parent / "explored.safetensors")
+        for name, key in EXPLORED.items():
+            value = rows[key].float()
+            if name in ("observation", "following"):
+                value = nn.functional.pad(value, (0, width - value.shape[-1]))
+            if name == "emitted":  # no residual
+                value = nn.functional.pad(value, (0, rows["action"].shape[-1]))
+            padded.setdefault(name, []).append(value)
+    return {name: torch.stack(values) for name, values in padded.items()}

@@ -158,6 +158,15 @@ class Learner:
             self.buffer[name].index_copy_(1, self.size.view(1), value.unsqueeze(1))
         self.size += 1
 
+    @torch.no_grad()
+    def give(self, rows: Mapping[str, Tensor]) -> None:
+        """Begin with transitions [N, R, *] of another policy."""
+        count = rows["reward"].shape[1]
+        for name, value in rows.items():
+            self.buffer[name][:, :count] = value.to(self.device)
+        self.size += count
+        self.norm.see(self.buffer["observation"][:, :count].transpose(0, 1).flatten(1))
+
     def update(self) -> None:
         losses, logged = self.losses(self.sample())
         gradients = torch.autograd.grad(losses.sum(), self.trained)
