@@ -172,6 +172,9 @@ def test_what_was_explored_is_given_as_in_the_recipe(tmp_path):
     torch.testing.assert_close(group.learner.norm(seen), norm(seen))
     group.update()
     assert group.owed == 0 and group.learner.updates == 601
+    raw = Group(described | {"raw": True}, slice(0, 1), [sees], muscles, 40, CPU).learner
+    torch.testing.assert_close(raw.buffer["emitted"], raw.buffer["action"])
+    torch.testing.assert_close(raw.buffer["action"][0, :600], rows["action"])
 
 
 @pytest.mark.parametrize("body", ["residual", "batch_norm"])

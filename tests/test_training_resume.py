@@ -20,6 +20,7 @@ from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Experiment, Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
+from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.stage import Stage
 
 WALL_CLOCK = ("frames_per_second", "wall_seconds")
@@ -240,6 +241,27 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
     summary = Experiment(resumed_config(run, quick), resume=run).run()
     assert summary["learn"]["frames"] == 608
     assert (run / "pictures" / "vaf.png").exists()
+
+
+def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'", "learn.reuse_exploration=true"))
+    update, updates = LearnStage.update, []
+
+    def update_and_signal(self):
+        updates.append(update(self))
+        if len(updates) == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return updates[-1]
+
+    monkeypatch.setattr(LearnStage, "update", update_and_signal)
+    with pytest.raises(Interrupted):
+        experiment.run()
+    assert len(updates) < 40
+    monkeypatch.undo()
+    Experiment(resumed_config(run), resume=run).run()
+    own = (608 - 96) * 0.25  # none for the batches up to 100 frames
+    assert experiment.folder.series("learn/updates")[1][-1] == own + 600 * 0.25
 
 
 def test_a_longer_budget_can_be_given_when_resuming(tmp_path):

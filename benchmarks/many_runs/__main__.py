@@ -13,9 +13,10 @@ says which runs; their evaluations go to a table with the columns of the bench's
 
 Runs of a group have one ``shape`` (see ``settings.Shape``) and ``settings`` of their own (see
 ``settings.Settings``). They may all name ``synergies``, a bundle that was explored before, whose
-frames, ``charged``, count among theirs; the group may then name a ``residual`` too, and with
-``reuse`` its runs learn from what was explored beside the bundles (``learn.reuse_exploration``
-leaves it there; as much for each). ``goals.py`` writes such a file.
+frames, ``charged``, count among theirs. The group may then name a ``residual``; with ``reuse`` its
+runs learn from what was explored beside the bundles (``learn.reuse_exploration`` leaves it there,
+as much for each), and with ``raw`` from that alone: they move muscles. ``goals.py`` writes such a
+file.
 """
 
 from __future__ import annotations

@@ -62,12 +62,14 @@ class Group:
         self.shape = Shape(**described.get("shape", {}))
         settings = [Settings(**run.get("settings", {})) for run in self.runs]
         decoders = None
-        if "synergies" in self.runs[0]:
+        if "synergies" in self.runs[0] and not described.get("raw"):
             residual = described.get("residual", 1.0)
             decoders = [load_bundle(run["synergies"], residual=residual)[0] for run in self.runs]
         # The seed of stage 2, see torchrl_etl.training.experiment.
         seeds = [2 * run["seed"] + 1 for run in self.runs]
-        given = explored(self.runs, max(observations)) if described.get("reuse") else None
+        given = None
+        if described.get("reuse"):
+            given = explored(self.runs, max(observations), raw=decoders is None)
         self.owed = 0  # updates for what is given, made up for as soon as learning starts
         room = frames
         if given is not None:
@@ -136,7 +138,7 @@ class Group:
         self.learner.told.copy_(self.told, non_blocking=True)
 
 
-def explored(runs: Sequence[Mapping[str, Any]], width: int) -> dict[str, Tensor]:
+def explored(runs: Sequence[Mapping[str, Any]], width: int, raw: bool) -> dict[str, Tensor]:
     """What stage 1 left beside the synergies of each run, as rows of the learner's buffer.
 
     As in :meth:`torchrl_etl.training.learn.LearnStage.take`.
@@ -148,7 +150,9 @@ def explored(runs: Sequence[Mapping[str, Any]], width: int) -> dict[str, Tensor]
             value = rows[key].float()
             if name in ("observation", "following"):
                 value = nn.functional.pad(value, (0, width - value.shape[-1]))
-            if name == "emitted":  # no residual
+            if name == "emitted" and raw:
+                value = rows["action"]
+            elif name == "emitted":  # no residual
                 value = nn.functional.pad(value, (0, rows["action"].shape[-1]))
             padded.setdefault(name, []).append(value)
     return {name: torch.stack(values) for name, values in padded.items()}

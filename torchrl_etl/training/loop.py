@@ -121,6 +121,8 @@ def run_stage(
         while not stage.finished:
             before = stage.frames
             report.batch(stage.collect(), stage.learn())
+            while stage.behind and not stop.requested:
+                stage.learn()
             if _passed(before, stage.frames, log_every) or stage.finished:
                 report.write()
             if evaluate is not None and (

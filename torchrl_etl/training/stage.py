@@ -197,13 +197,20 @@ class Stage(ABC):
         self.progress.owed += self.action_repeat * transitions * self.updates_per_frame
 
     def learn(self) -> TensorDictBase | None:
-        """The updates that the collected frames have earned; returns their mean scalars."""
-        # What more than one batch is owed, for frames that were given, is made up for in parts.
+        """The updates that the collected frames have earned; returns their mean scalars.
+
+        The thousands for frames that were given are made up for in parts, see :attr:`behind`.
+        """
         due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
         self.progress.updates += due
         logs = [self.update() for _ in range(due)]
         return torch.stack(logs).mean(0) if logs else None
+
+    @property
+    def behind(self) -> bool:
+        """Whether :meth:`learn` left updates for later."""
+        return self.progress.owed >= 1
 
     def update(self) -> TensorDictBase:
         """One gradient step on every part that this stage trains; returns scalars to log."""
