@@ -264,6 +264,21 @@ def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_pa
     assert experiment.folder.series("learn/updates")[1][-1] == own + 600 * 0.25
 
 
+def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path):
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'", "stage=explore"))
+    experiment.run()
+    file = experiment.folder.explored
+    file.rename(f"{file}.away")
+    with pytest.raises(FileNotFoundError, match="is gone, and stage 2 begins with"):
+        Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
+    Path(f"{file}.away").rename(file)
+    Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
+    whole = tmp_path / "whole"
+    Experiment(tiny(f"run_dir='{whole}'")).run()
+    assert numbers(run) == numbers(whole)
+
+
 def test_a_longer_budget_can_be_given_when_resuming(tmp_path):
     run = tmp_path / "run"
     Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "learn.frames=320")).run()

@@ -18,9 +18,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from torchrl_etl.modules.bundle import load_bundle
+
 ROOT = Path(__file__).parents[2]
 TASKS = ("myo2HandPose", "myoHandKeyTurn", "myoHandPenTwirl")
-EXPLORED = 4000  # frames, which are charged
+EXPLORED = 4000  # frames; an exploration ends with a whole batch
 
 
 def main() -> None:
@@ -40,21 +42,26 @@ def main() -> None:
     with ThreadPoolExecutor(arguments.jobs) as pool:
         bundles = list(pool.map(lambda run: explored(run, arguments.folder), runs))
     etl = [
-        run | {"method": "etl", "synergies": os.path.relpath(bundle), "charged": EXPLORED}
+        run | {"method": "etl", "synergies": os.path.relpath(bundle), "charged": charged(bundle)}
         for run, bundle in zip(runs, bundles, strict=True)
     ]
-    groups = [{"runs": [run | {"method": "sac"} for run in runs]}, {"runs": etl}]
+    groups = [{"runs": [run | {"method": "sac"} for run in runs]}, {"reuse": True, "runs": etl}]
     described = {"frames": arguments.frames, "groups": groups}
     (arguments.folder / "runs.json").write_text(json.dumps(described, indent=1), encoding="utf-8")
     print(f"{2 * len(runs)} runs: {arguments.folder / 'runs.json'}")
 
 
 def explored(run: dict[str, str | int], folder: Path) -> Path:
-    """The folder of a run of stage 1 alone."""
+    """The bundle of a run of stage 1 alone."""
     path = (folder / "{task}-{goal}-seed{seed}".format(**run)).resolve()
     if not (path / "synergies").is_dir():
         subprocess.run([*command(run), f"run_dir={path}"], check=True, cwd=ROOT)
-    return path
+    return path / "synergies"
+
+
+def charged(bundle: Path) -> int:
+    """Frames of an exploration, which ends with a whole batch."""
+    return load_bundle(bundle)[1].facts["frames"]
 
 
 def command(run: dict[str, str | int]) -> Iterator[str]:

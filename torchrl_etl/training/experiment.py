@@ -245,9 +245,7 @@ class Experiment:
     ) -> dict[str, Any]:
         stage = self.learn_stage(decoder)
         if self._reuses and decoder is not None:  # a checkpoint, if there is one, replaces it
-            tensors = safetensors.torch.load(self.folder.explored.read_bytes())
-            rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
-            stage.take(rows.to(self.device))
+            stage.take(self._explored())
         evaluator = self.evaluator(stage)
         last = run_stage(
             stage,
@@ -271,6 +269,18 @@ class Experiment:
                 "high": value.high,
             }
         return summary
+
+    def _explored(self) -> TensorDict:
+        """The transitions that stage 1 left."""
+        file = self.folder.explored
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file} is gone, and stage 2 begins with the transitions in it; start a new run, "
+                f"with synergies={self.path} if it shall have the same synergies."
+            )
+        tensors = safetensors.torch.load(file.read_bytes())
+        rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
+        return rows.to(self.device)
 
     def _draw_curves(self, charged: int) -> None:
         frames, returns = self.folder.series("learn/eval/return")
@@ -340,11 +350,7 @@ class Experiment:
 
     @property
     def _reuses(self) -> bool:
-        return (
-            self.config.learn.reuse_exploration
-            and self.config.synergies is None
-            and self.config.stage == "all"
-        )
+        return self.config.learn.reuse_exploration and self.config.synergies is None
 
     @property
     def _shows_activations(self) -> bool:
