@@ -67,16 +67,13 @@ class Group:
             decoders = [load_bundle(run["synergies"], residual=residual)[0] for run in self.runs]
         # The seed of stage 2, see torchrl_etl.training.experiment.
         seeds = [2 * run["seed"] + 1 for run in self.runs]
-        given = None
+        given, count = None, 0
         if described.get("reuse"):
             given = explored(self.runs, max(observations), raw=decoders is None)
-        self.owed = 0  # updates for what is given, made up for as soon as learning starts
-        room = frames
-        if given is not None:
-            room += (count := given["reward"].shape[1])
-            self.owed = count * self.shape.updates
+            count = given["reward"].shape[1]
+        self.owed = count * self.shape.updates  # made up for as soon as learning starts
         self.learner = Learner(
-            self.shape, settings, seeds, observations, actions, decoders, room, device
+            self.shape, settings, seeds, observations, actions, decoders, frames + count, device
         )
         if given is not None:
             self.learner.give(given)
