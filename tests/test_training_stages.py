@@ -13,7 +13,6 @@ from tests.configs import tiny
 from tests.stages import changed, explore_stage, fill, learn_stage, snapshot
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.modules.bundle import load_bundle
 from torchrl_etl.training import Experiment, fit_gmvae
 
 
@@ -36,32 +35,8 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     torch.testing.assert_close(first["action"], kept["action"])
     # explore.reward_scale is 0.1
     torch.testing.assert_close(first["next", "reward"], 30 * kept["next", "reward"])
-    synergy, residual = first["synergy"].split([decoder.num_synergies, decoder.action_dim], -1)
-    assert synergy.abs().max() <= 1
-    # The bundle's decoder takes them to the actions, but where the residual does not reach.
-    initial, _ = load_bundle(tmp_path / "run" / "synergies", residual=decoder.residual)
-    reached = residual.abs() < 1
-    assert reached.any()
-    torch.testing.assert_close(initial(first)["action"][reached], first["action"][reached])
-
-
-@pytest.mark.parametrize("residual", [0.25, 1.0])
-def test_coefficients_are_completed_by_the_residual_that_decodes_them_to_an_action(residual):
-    decoder = SynergyDecoder(2, 3, low=[0.0, -1.0, -2.0], high=[1.0, 1.0, 2.0], residual=residual)
-    for parameter in decoder.parameters():
-        parameter.data.zero_()  # decodes to the middle of the range: 0.5, 0, 0
-    synergy, action = torch.tensor([[0.1, -0.2]]), torch.tensor([[0.6, -0.25, 2.0]])
-    completed = decoder.complete(synergy, action)
-    # (a - 0.5) / (ρ/2), a / ρ and a / 2ρ, within [-1, 1].
-    expected = torch.tensor([[0.1, -0.2, 0.2 / residual, -0.25 / residual, 1.0]])
-    torch.testing.assert_close(completed, expected)
-    nearest = torch.tensor([[0.6, -0.25, 2 * residual]])
-    torch.testing.assert_close(decoder(TensorDict(synergy=completed))["action"], nearest)
-
-
-def test_coefficients_without_a_residual_stay_as_they_are():
-    synergy = torch.rand(4, 2)
-    assert torch.equal(SynergyDecoder(2, 3).complete(synergy, torch.rand(4, 3)), synergy)
+    assert (first["synergy"][:, decoder.num_synergies :] == 0).all()
+    assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
 
 
 def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():

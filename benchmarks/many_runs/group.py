@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import load_bundle
 
 from .learner import Learner
@@ -70,7 +69,7 @@ class Group:
         seeds = [2 * run["seed"] + 1 for run in self.runs]
         given, count = None, 0
         if described.get("reuse"):
-            given = explored(self.runs, max(observations), decoders)
+            given = explored(self.runs, max(observations), raw=decoders is None)
             count = given["reward"].shape[1]
         self.owed = count * self.shape.updates  # made up for as soon as learning starts
         self.learner = Learner(
@@ -136,23 +135,21 @@ class Group:
         self.learner.told.copy_(self.told, non_blocking=True)
 
 
-def explored(
-    runs: Sequence[Mapping[str, Any]], width: int, decoders: Sequence[SynergyDecoder] | None
-) -> dict[str, Tensor]:
+def explored(runs: Sequence[Mapping[str, Any]], width: int, raw: bool) -> dict[str, Tensor]:
     """What stage 1 left beside the synergies of each run, as rows of the learner's buffer.
 
-    As in :meth:`torchrl_etl.training.learn.LearnStage.take`; without decoders what was emitted is
-    the action.
+    As in :meth:`torchrl_etl.training.learn.LearnStage.take`.
     """
     padded: dict[str, list[Tensor]] = {}
-    for i, run in enumerate(runs):
+    for run in runs:
         rows = load_file(Path(run["synergies"]).parent / "explored.safetensors")
         for name, key in EXPLORED.items():
             value = rows[key].float()
             if name in ("observation", "following"):
                 value = nn.functional.pad(value, (0, width - value.shape[-1]))
-            if name == "emitted":
-                action = rows["action"].float()
-                value = decoders[i].complete(value, action) if decoders else action
+            if name == "emitted" and raw:
+                value = rows["action"]
+            elif name == "emitted":  # no residual
+                value = nn.functional.pad(value, (0, rows["action"].shape[-1]))
             padded.setdefault(name, []).append(value)
     return {name: torch.stack(values) for name, values in padded.items()}

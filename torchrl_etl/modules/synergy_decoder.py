@@ -176,25 +176,6 @@ class SynergyDecoder(SynergyMap):
         scaled = self.module
         return ((gmvae.infer(action) - scaled.center) / scaled.scale).clamp(-1, 1)
 
-    @torch.no_grad()
-    def complete(self, synergy: Tensor, action: Tensor) -> Tensor:
-        """Coefficients [*, d] and the residual that takes what they decode to nearest to an action.
-
-        Args:
-            synergy (Tensor): coefficients in [-1, 1]^d.
-            action (Tensor): actions [*, n].
-
-        Returns:
-            Tensor: all entries of the synergy key [*, d+n]; without a residual the coefficients
-            as they came.
-        """
-        if not self.residual:
-            return synergy
-        scaled = self.module
-        decoded = scaled.decoder(scaled.center + scaled.scale * synergy)
-        reach = self.residual * (self.high - self.low) / 2
-        return torch.cat([synergy, ((action - decoded) / reach).clamp(-1, 1)], -1)
-
     @property
     def config(self) -> dict[str, Any]:
         """JSON-able arguments: ``SynergyDecoder(**config)`` plus a state dict rebuilds it."""

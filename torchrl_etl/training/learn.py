@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
@@ -92,11 +92,10 @@ class LearnStage(SACStage):
         """Learn from transitions of another policy too, as often as from frames of one's own.
 
         The critics value executed actions, so it does not matter which policy chose them. Their
-        ``synergy`` has d entries; where there is a residual, theirs is what is missing to the
-        action, so that Eq. 10 holds the decoder where it is rather than pull it to their actions.
+        ``synergy`` has d entries; where there is a residual, theirs is zero.
         """
-        rows = rows.to(self.device).copy()
-        rows["synergy"] = self.decoder.complete(rows["synergy"], rows["action"])
+        missing = self.decoder.synergy_dim - rows["synergy"].shape[-1]
+        rows = rows.copy().set("synergy", nn.functional.pad(rows["synergy"], (0, missing)))
         if self.norm is not None:
             self.norm.see(rows["observation"])
         self.buffer.extend(self.transitions(rows))
