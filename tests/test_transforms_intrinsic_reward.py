@@ -172,10 +172,12 @@ def test_extrinsic_weight_adds_the_task_reward(weight, expected):
     assert data["next", "reward"].item() == 10.0
 
 
-def test_extrinsic_reward_is_added_after_the_division():
-    data = transitions([0.0, 0.0], [1.0, -1.0], [1.0, 1.0], rewards=[10.0, 10.0])
-    IntrinsicReward(doubler(), extrinsic_weight=1.0)(data)
-    torch.testing.assert_close(data["next", "intrinsic_reward"].flatten(), torch.tensor([11.0, 9]))
+def test_bonus_and_task_reward_are_each_divided_by_their_own_deviation():
+    data = transitions([0.0, 0.0], [1.0, -1.0], [1.0, 1.0], rewards=[10.0, 16.0])
+    IntrinsicReward(doubler(), extrinsic_weight=0.5)(data)
+    # Bonuses 2 and -2 have a deviation of 2, rewards one of 3.
+    expected = torch.tensor([1 + 0.5 * 10 / 3, -1 + 0.5 * 16 / 3])
+    torch.testing.assert_close(data["next", "intrinsic_reward"].flatten(), expected)
 
 
 def test_division_keeps_the_sign_and_makes_the_deviation_one():

@@ -68,8 +68,9 @@ class IntrinsicReward(TransitionReward):
 
     Deviates: the print uses the bare bonus, whose scale drifts with φ. By default it is divided by
     its running standard deviation (no mean is subtracted: the sign says towards or away), and by
-    no less than a tenth of its root mean square; ``normalize=False`` is the print. The reward of
-    stage 1 is the bonus alone, as in Algorithm 1; ``extrinsic_weight=1`` is the text's r^e + r^b.
+    no less than a tenth of its root mean square, and so is the task's reward where it is added;
+    ``normalize=False`` is the print. By default the reward is the bonus alone, as in Algorithm 1;
+    ``extrinsic_weight=1`` is the text's r^e + r^b.
 
     Args:
         encoder (TensorDictModuleBase): φ, with one in-key and one out-key. Its own key names need
@@ -79,11 +80,11 @@ class IntrinsicReward(TransitionReward):
         in_keys (sequence of NestedKey): keys of observation and direction. Default:
             ``("observation", "direction")``.
         out_key (NestedKey): Default: ``"intrinsic_reward"``.
-        normalize (bool): divide the bonus by its running standard deviation. Default: ``True``.
+        normalize (bool): divide bonus and task reward by their running standard deviations.
+            Default: ``True``.
         decay (float): in (0, 1); a call (one env step or one sampled batch) weighs ``1 - decay`` in
             the running statistics. Default: 0.99.
-        extrinsic_weight (float): weight of the task's reward, added after the division.
-            Default: 0.
+        extrinsic_weight (float): weight of the task's reward. Default: 0.
         reward_key (NestedKey): the task's reward, read where ``extrinsic_weight`` is not 0.
             Default: ``"reward"``.
         update_statistics (bool): whether calls update the running statistics; an attribute of the
@@ -164,6 +165,7 @@ class IntrinsicReward(TransitionReward):
         # in eval mode under the learner's feet, and be saved twice.
         self.__dict__["_encoder"] = encoder
         self.deviation = _RunningDeviation(decay) if normalize else None
+        self.reward_deviation = _RunningDeviation(decay) if normalize and extrinsic_weight else None
         self.extrinsic_weight = extrinsic_weight
         self.reward_key = unravel_key(reward_key)
         self.update_statistics = update_statistics
@@ -192,13 +194,17 @@ class IntrinsicReward(TransitionReward):
             )
         bonus = direction_bonus(embedding, next_embedding, direction.to(embedding.device))
         bonus = bonus.to(direction.device)
-        if self.deviation is not None:
-            if self.deviation.mean.device != bonus.device:
-                self.deviation.to(bonus.device)
-            if self.update_statistics:
-                self.deviation.update(bonus)
-            bonus = bonus / self.deviation.divisor
+        bonus = self._scaled(bonus, self.deviation)
         if self.extrinsic_weight:
             reward = self._read(next_tensordict, self.reward_key, "next")
-            bonus = bonus + self.extrinsic_weight * reward
+            bonus = bonus + self.extrinsic_weight * self._scaled(reward, self.reward_deviation)
         return (bonus,)
+
+    def _scaled(self, values: Tensor, deviation: _RunningDeviation | None) -> Tensor:
+        if deviation is None:
+            return values
+        if deviation.mean.device != values.device:
+            deviation.to(values.device)
+        if self.update_statistics:
+            deviation.update(values)
+        return values / deviation.divisor
