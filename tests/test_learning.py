@@ -23,6 +23,7 @@ def test_stage_1_finds_actions_in_the_subspace_that_moves_the_joints(basis):
         tiny(
             "run_dir=unused",
             "goal=random",
+            "explore.bonus.extrinsic_weight=1",  # at 4 it finds none here (docs/results/log.md, 69)
             "explore.frames=3000",
             "explore.updates_per_frame=0.5",
             "explore.batch_size=128",

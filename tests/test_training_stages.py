@@ -71,7 +71,7 @@ def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
 
 
 def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
-    stage = explore_stage("explore.bonus.normalize=false")
+    stage = explore_stage("explore.bonus.normalize=false", "explore.bonus.extrinsic_weight=0")
     fill(stage)
 
     def bonus_and_expected():

@@ -45,11 +45,12 @@ class ExploreStage(Stage):
     """Algorithm 1, phase 1: SAC on the intrinsic reward, the metric and the GMVAE side by side.
 
     Every update draws one batch. Its bonus is computed as it is drawn, with the state encoder as
-    it then is; SAC learns on the bonus, the encoder on the behavioral metric with the task's own
-    reward, and the GMVAE on the batch's actions.
+    it then is; SAC learns on the bonus (and the task's reward, if that has a weight), the encoder
+    on the behavioral metric with the task's own reward, and the GMVAE on the batch's actions.
 
-    Deviates: batches get directions drawn anew (``redraw=1``), without which some thousand frames
-    lead nowhere in particular; 0 is the print. The GMVAE sees the mean actions of the policy as it
+    Deviates: the recipes pay stage 1 with the task's reward too (``bonus.extrinsic_weight=4``);
+    0 is Algorithm 1. Batches get directions drawn anew (``redraw=1``), without which some thousand
+    frames lead nowhere in particular; 0 is the print. The GMVAE sees the mean actions of the policy as it
     is (``actions="policy"``) or was when it acted (``"mean"``), since actions sampled from a
     maximum-entropy policy are nearly white noise that few synergies cannot explain; ``"sampled"``
     is the print. After the last frame the GMVAE is trained on for ``final_updates`` (Algorithm 1
