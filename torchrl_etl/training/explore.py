@@ -50,11 +50,11 @@ class ExploreStage(Stage):
 
     Deviates: the recipes pay stage 1 with the task's reward too (``bonus.extrinsic_weight=4``);
     0 is Algorithm 1. Batches get directions drawn anew (``redraw=1``), without which some thousand
-    frames lead nowhere in particular; 0 is the print. The GMVAE sees the mean actions of the policy as it
-    is (``actions="policy"``) or was when it acted (``"mean"``), since actions sampled from a
-    maximum-entropy policy are nearly white noise that few synergies cannot explain; ``"sampled"``
-    is the print. After the last frame the GMVAE is trained on for ``final_updates`` (Algorithm 1
-    stops with the last frame: 0).
+    frames lead nowhere in particular; 0 is the print. The GMVAE sees the mean actions of the
+    policy as it is (``actions="policy"``) or was when it acted (``"mean"``), since actions sampled
+    from a maximum-entropy policy are nearly white noise that few synergies cannot explain;
+    ``"sampled"`` is the print. After the last frame the GMVAE is trained on for ``final_updates``
+    (Algorithm 1 stops with the last frame: 0).
 
     Args:
         make_base_env (callable): environment to which the direction is added.
