@@ -22,7 +22,7 @@ from torchrl_etl.modules.bundle import load_bundle
 
 ROOT = Path(__file__).parents[2]
 TASKS = ("myo2HandPose", "myoHandKeyTurn", "myoHandPenTwirl")
-EXPLORED = 4000  # frames; an exploration ends with a whole batch
+EXPLORED = 4000  # frames
 
 
 def main() -> None:
