@@ -37,6 +37,27 @@ def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
     stage.close()
 
 
+@pytest.mark.parametrize("layout", [(16,), (2, 8), (2, 2, 4)])
+def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
+    """[time] of one simulator, [simulators, time], [workers, simulators, time]."""
+    settings = ("method=sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
+    stage = Experiment(tiny("run_dir=unused", *settings)).learn_stage(None)
+    stage.restart_collection()
+    batch = stage.batches.next().reshape(-1)[:16].reshape(layout)
+    batch["next", "reward"] = torch.arange(16.0).reshape(*layout, 1)
+    batch["next", "done"] = torch.zeros(*layout, 1, dtype=torch.bool)
+    stage.batches.next = lambda: batch
+    stage.collect()
+    returns = []
+    for rewards in torch.arange(16.0).reshape(-1, layout[-1]).tolist():
+        earned = 0.0
+        for reward in rewards:
+            returns.append(earned := reward + stage.return_scale.gamma * earned)
+    assert stage.return_scale.largest.item() == pytest.approx(max(returns))
+    assert stage.return_scale.mean.item() == pytest.approx(sum(returns) / 16)
+    stage.close()
+
+
 @pytest.mark.parametrize("method", ["sac", "etl", "lattice", "dynsyn", "eme", "sar"])
 def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp_path):
     settings = (f"method={method}", "learn.sac.normalize_observations=true", f"run_dir={tmp_path}")

@@ -182,7 +182,9 @@ class Stage(ABC):
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
-        batch = self.seen(self.batches.next().to(self.device))
+        batch = self.batches.next().to(self.device)
+        # One simulator has no dimension of its own, and several workers have one more.
+        batch = self.seen(batch.reshape(-1, batch.shape[-1]))
         if len(rows := self.spanned(batch)):
             self.buffer.extend(self.transitions(rows))
         batch = batch.reshape(-1)
