@@ -223,24 +223,67 @@ def test_without_actions_the_box_spans_the_prior() -> None:
     torch.testing.assert_close(scaled.scale, torch.tensor([3.5, 4.0]))
 
 
-def test_residual_by_hand_and_its_clamp() -> None:
+def test_residual_by_hand() -> None:
     decoder = SynergyDecoder(1, 2, low=[0.0, -1.0], high=[1.0, 3.0], hidden=(4,), residual=0.5)
     for parameter in decoder.parameters():
-        nn.init.zeros_(parameter)  # every action is the middle of its range: (0.5, 1)
+        nn.init.zeros_(parameter)  # synergies leave both in the middle of their range: (0.5, 1)
     middle = torch.tensor([[0.3, 0.0, 0.0], [0.3, 1.0, -0.5], [0.3, -0.2, 1.0]])
     expected = torch.tensor([[0.5, 1.0], [0.75, 0.5], [0.45, 2.0]])
     torch.testing.assert_close(decoder(middle), expected)
-    bias_of_last_layer(decoder).copy_(torch.tensor([20.0, -20.0]))  # now (1, -1)
+    torch.testing.assert_close(decoder.log_slope(middle), torch.zeros(3))
+    # Now at 0.6 and -0.6 of their half range; (0.6 + 0.5) / 1.3 = 11/13 and (0.6 - 0.5) / 0.7.
+    bias_of_last_layer(decoder).copy_(torch.tensor([0.6, -0.6]).atanh())
+    synergy = torch.tensor([[0.3, 1.0, 1.0], [0.3, -1.0, 0.0]])
+    unit = torch.tensor([[11 / 13, -1 / 7], [1 / 7, -0.6]])
     torch.testing.assert_close(
-        decoder(torch.tensor([[0.0, 1.0, -1.0], [0.0, -1.0, 1.0]])),
-        torch.tensor([[1.0, -1.0], [0.75, 0.0]]),
+        decoder(synergy),
+        torch.tensor([0.5, 1.0]) + torch.tensor([0.5, 2.0]) * unit,
+        atol=5e-4,
+        rtol=0,
     )
+    slopes = torch.tensor([[0.64 / 1.3**2, 0.64 / 0.7**2], [0.64 / 0.7**2, 0.64]])
+    torch.testing.assert_close(decoder.log_slope(synergy), slopes.log().sum(-1), atol=1e-3, rtol=0)
+    assert decoder.log_slope(synergy[0]).shape == ()
+
+
+def test_a_whole_residual_reaches_every_action_from_all_coefficients() -> None:
+    decoder = fitted(residual=1.0)[1].double()
+    wanted = uniform(500, LOW, HIGH).double()
+    coefficients = torch.cat([uniform(500, dim=2), torch.zeros(500, 4)], -1).double()
+    base, _ = decoder.module.summands(coefficients)
+    unit = decoder.module.decoder.normalize(wanted)
+    coefficients[:, 2:] = (unit - base) / (1 - unit * base)
+    assert coefficients.abs().max() <= 1
+    torch.testing.assert_close(decoder(coefficients), wanted)
+
+
+def test_no_residual_is_without_effect_at_the_ends_of_the_range() -> None:
+    decoder = SynergyDecoder(1, 2, hidden=(4,), residual=1.0)
+    bias_of_last_layer(decoder).copy_(torch.tensor([20.0, -20.0]))  # a tanh of 1 and -1
+    synergy = torch.tensor([[0.0, 0.9, -0.9], [0.0, -0.9999, 0.9999], [0.0, -1.0, 1.0]])
+    synergy.requires_grad_()
+    decoder(synergy).sum().backward()
+    assert (synergy.grad[:2, 1:] != 0).all() and synergy.grad.isfinite().all()
+    assert decoder.log_slope(synergy).isfinite().all()
 
 
 @pytest.mark.parametrize("residual", [-0.1, 1.1])
 def test_residual_share_is_checked(residual: float) -> None:
     with pytest.raises(ValueError, match=r"must lie in \[0, 1\]"):
         SynergyDecoder(2, 4, residual=residual)
+
+
+@pytest.mark.parametrize("residual", [0.0, 0.3])
+def test_log_slope_is_the_determinant_of_the_residuals_jacobian(residual: float) -> None:
+    decoder = fitted(residual)[1].double()
+    synergy = uniform(3, dim=decoder.synergy_dim).double()
+    expected = torch.zeros(3, dtype=torch.float64)
+    if residual:
+        at_rest = (torch.as_tensor(HIGH) - torch.as_tensor(LOW)) / 2 * residual
+        for i, row in enumerate(synergy):
+            jacobian = torch.func.jacrev(decoder.module)(row)[:, 2:]
+            expected[i] = jacobian.det().log() - at_rest.double().log().sum()
+    torch.testing.assert_close(decoder.log_slope(synergy), expected)
 
 
 @pytest.mark.parametrize("residual", [0.0, 0.3])

@@ -23,10 +23,16 @@ from torchrl_etl.objectives import SynergySACLoss
 
 
 def fresh_synergy(loss: SynergySACLoss, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """The draw that the loss makes from the same seed, and its log-probability."""
+    """The draw that the loss makes from the same seed, and the log-probability of what it does."""
     distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
     torch.manual_seed(SEED)
-    return distribution.rsample_and_log_prob()
+    synergy, log_prob = distribution.rsample_and_log_prob()
+    if share := loss.decoder_network.residual:
+        # tanh⁻¹a = tanh⁻¹b + tanh⁻¹(ρr), hence ∂a/∂(ρr) = (1 - a²) / (1 - (ρr)²).
+        action, residual = action_of(loss, synergy), share * synergy[..., SYNERGIES:]
+        slope = (1 - action.square()) / (1 - residual.square())
+        log_prob = log_prob - slope.log().sum(-1)
+    return synergy, log_prob
 
 
 def action_of(loss: SynergySACLoss, synergy: Tensor) -> Tensor:
@@ -81,10 +87,10 @@ def move(params: Any, by: float = 0.5) -> None:
                 value.add_(by * torch.randn_like(value))
 
 
-@pytest.fixture
-def loss() -> SynergySACLoss:
+@pytest.fixture(params=[0.0, 0.3], ids=["synergies", "with a residual"])
+def loss(request: pytest.FixtureRequest) -> SynergySACLoss:
     torch.manual_seed(0)
-    loss = make_loss(loss_function="l2", alpha_init=0.3)
+    loss = make_loss(loss_function="l2", alpha_init=0.3, residual=request.param)
     SoftUpdate(loss, tau=0.1)
     move(loss.target_qvalue_network_params.apply(lambda x: x.requires_grad_(False)))
     return loss
@@ -232,7 +238,7 @@ def test_actor_loss_by_hand() -> None:
 def rebuilt(loss: SynergySACLoss) -> SynergySACLoss:
     """Another loss with the same state and nothing else in common."""
     torch.manual_seed(99)
-    other = make_loss(loss_function="l2")
+    other = make_loss(loss_function="l2", residual=loss.decoder_network.residual)
     SoftUpdate(other, tau=0.1)
     other.load_state_dict(loss.state_dict())
     return other

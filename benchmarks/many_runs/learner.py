@@ -18,6 +18,8 @@ from torchrl_etl.functional import (
     categorical_mean,
     project_categorical,
     reconstruction_loss,
+    tanh_sum,
+    tanh_sum_log_slope,
 )
 from torchrl_etl.modules import RunningNorm, SynergyDecoder
 from torchrl_etl.training.stage import entropy_target
@@ -29,6 +31,7 @@ from .settings import Settings, Shape
 __all__ = ["Learner"]
 
 SMALLEST_STD = 0.01
+INSIDE = 1.0 - 1e-4  # the bounds that synergies alone keep to, as in SynergyDecoder
 
 
 class Learner:
@@ -197,11 +200,11 @@ class Learner:
             loc, scale = self._policy(batch["observation"], self.actor.weights)
             with torch.no_grad():
                 next_loc, next_scale = self._policy(batch["following"], self.actor.weights)
-        emitted, log_prob = _sampled(loc, scale)
+        action, log_prob = self._chosen(loc, scale)
         with torch.no_grad():
-            next_emitted, next_log_prob = _sampled(next_loc, next_scale)
+            next_action, next_log_prob = self._chosen(next_loc, next_scale)
             start = torch.cat([batch["observation"], batch["action"]], -1)
-            end = torch.cat([batch["following"], self._decode(next_emitted)], -1)
+            end = torch.cat([batch["following"], next_action], -1)
             outputs = self._logits(self.target_body, self.target, end, beside=start)
             smaller = categorical_mean(outputs, self.support).argmin(1)[:, None, :, None]
             probabilities = outputs.gather(1, smaller.expand_as(outputs[:, :1])).squeeze(1)
@@ -211,7 +214,7 @@ class Learner:
         outputs = self._logits(self.critic.body, self.critic.weights, start, beside=end)
         loss_critic = categorical_cross_entropy(outputs, target.unsqueeze(1)).sum(1).mean(-1)
 
-        chosen = torch.cat([batch["observation"], self._decode(emitted)], -1)
+        chosen = torch.cat([batch["observation"], action], -1)
         outputs = self._logits(self.critic.body, self.critic.weights.detach(), chosen)
         values = categorical_mean(outputs, self.support).amin(1)
         loss_actor = (alpha * log_prob - values).mean(-1)
@@ -248,14 +251,27 @@ class Learner:
         logits = body(each, iter(self.critic.split(weights)), training)
         return logits[:, : inputs.shape[1]].unflatten(0, (self.count, self.shape.num_critics))
 
+    def _chosen(self, loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+        """Fresh muscles [N, B, n] and the log-probability [N, B] of what chose them."""
+        emitted, log_prob = _sampled(loc, scale)
+        if self.decoder is None or not self.residual:
+            return self._decode(emitted), log_prob
+        summands = self._summands(emitted)
+        return tanh_sum(*summands), log_prob - tanh_sum_log_slope(*summands).sum(-1)
+
     def _decode(self, emitted: Tensor) -> Tensor:
         if self.decoder is None:
             return emitted
+        if not self.residual:
+            return self._base(emitted)
+        return tanh_sum(*self._summands(emitted))
+
+    def _summands(self, emitted: Tensor) -> tuple[Tensor, Tensor]:
         latent = self.center.shape[-1]
-        action = self.decoder(self.center + self.box * emitted[..., :latent]).tanh()
-        if self.residual:
-            action = (action + self.residual * emitted[..., latent:]).clamp(-1, 1)
-        return action
+        return INSIDE * self._base(emitted[..., :latent]), self.residual * emitted[..., latent:]
+
+    def _base(self, coefficients: Tensor) -> Tensor:
+        return self.decoder(self.center + self.box * coefficients).tanh()
 
     @torch.no_grad()
     def sample(self) -> dict[str, Tensor]:

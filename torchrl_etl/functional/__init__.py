@@ -32,6 +32,7 @@ from torchrl_etl.functional.synergy import (
     mixture_log_prob,
     reconstruction_loss,
 )
+from torchrl_etl.functional.tanh_sum import tanh_sum, tanh_sum_log_slope
 
 __all__ = [
     "GMVAEBound",
@@ -54,4 +55,6 @@ __all__ = [
     "mixture_log_prob",
     "project_categorical",
     "reconstruction_loss",
+    "tanh_sum",
+    "tanh_sum_log_slope",
 ]

@@ -12,9 +12,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
+from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
 
 __all__ = ["SynergyDecoder", "SynergyMap"]
+
+# In single precision a tanh reaches 1, from where no residual leads back.
+_INSIDE = 1.0 - 1e-4
 
 
 class _ScaledDecoder(nn.Module):
@@ -28,13 +32,15 @@ class _ScaledDecoder(nn.Module):
         self.register_buffer("scale", torch.ones(decoder.latent_dim))
 
     def forward(self, synergy: Tensor) -> Tensor:
-        decoder = self.decoder
         if not self.residual:
-            return decoder(self.center + self.scale * synergy)
-        synergy, residual = synergy.split([decoder.latent_dim, decoder.action_dim], -1)
-        half_range = (decoder.high - decoder.low) / 2
-        action = decoder(self.center + self.scale * synergy) + self.residual * half_range * residual
-        return action.clamp(decoder.low, decoder.high)
+            return self.decoder(self.center + self.scale * synergy)
+        return self.decoder.denormalize(tanh_sum(*self.summands(synergy)))
+
+    def summands(self, synergy: Tensor) -> tuple[Tensor, Tensor]:
+        """What synergies and residual add to an action, [*, n] each, where bounds are [-1, 1]."""
+        synergy, residual = synergy.split([self.decoder.latent_dim, self.decoder.action_dim], -1)
+        base = self.decoder.unit(self.center + self.scale * synergy)
+        return _INSIDE * base, self.residual * residual
 
 
 class SynergyMap(TensorDictModule):
@@ -71,7 +77,9 @@ class SynergyDecoder(SynergyMap):
     the GMVAE's aggregate posterior, so that the box covers the latents that real actions have.
 
     With ``residual=ρ > 0`` the synergy key has d + n entries; the last n are a raw action in
-    [-1, 1]^n that moves each muscle by at most ρ of its half range.
+    [-1, 1]^n that moves each muscle, from the middle of its range by at most ρ of its half. It is
+    added before the bounds (:func:`~torchrl_etl.functional.tanh_sum`): from ρ = 1 on every action
+    is within reach of all coefficients.
 
     Equation: a = Dec(z^a) of section 4.2.
 
@@ -166,6 +174,16 @@ class SynergyDecoder(SynergyMap):
             scaled.center.copy_((high + low) / 2)
             scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
         return decoder
+
+    def log_slope(self, synergy: Tensor) -> Tensor:
+        """How far the action moves with the residual: ln |det ∂a/∂r| [*] at ``synergy`` [*, d+n].
+
+        Relative to where the synergies leave every muscle in the middle of its range; 0 without a
+        residual.
+        """
+        if not self.residual:
+            return synergy.new_zeros(synergy.shape[:-1])
+        return tanh_sum_log_slope(*self.module.summands(synergy)).sum(-1)
 
     @torch.no_grad()
     def encode(self, gmvae: GMVAE, action: Tensor) -> Tensor:

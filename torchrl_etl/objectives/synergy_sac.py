@@ -28,6 +28,11 @@ class SynergySACLoss(LeanSACLoss):
     targets stay right while the decoder moves, and the actor loss can carry the task's reward
     into the decoder.
 
+    Entropy is that of the coefficients and of the action given them: a decoder with a residual
+    says by its ``log_slope`` how far the action moves with it
+    (:meth:`~torchrl_etl.modules.SynergyDecoder.log_slope`). Without this, noise that the bounds of
+    the action swallow would count.
+
     Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL, without a state-value network.
 
     Deviates: Eq. 10 alone brings no reward to the decoder (it regresses Dec(z) on a = Dec(z));
@@ -148,6 +153,15 @@ class SynergySACLoss(LeanSACLoss):
         ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         following = (unravel_key(("next", key)) for key in (*observed, *ends))
         self._in_keys = list(dict.fromkeys((*observed, self.decoded_key, *following)))
+
+    def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        synergy, log_prob = super()._sample(tensordict)
+        if not hasattr(self.decoder_network, "log_slope"):
+            return synergy, log_prob
+        params = self.decoder_network_params
+        params = params if self.train_decoder else params.detach()
+        with params.to_module(self.decoder_network, preserve_module_state=False):
+            return synergy, log_prob - self.decoder_network.log_slope(synergy)
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)

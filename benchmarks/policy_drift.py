@@ -1,0 +1,100 @@
+"""How a trained policy moves muscles, and how far more updates still move it.
+
+    python benchmarks/policy_drift.py RUN [RUN ...] --out docs/results/policy_drift.csv
+
+RUN is a run folder with a checkpoint of stage 2, ETL's or a rival's. On a thousand of the newest
+observations, where a muscle's bounds are ±1: ``mean_size`` is the root mean square of the muscles
+that the actor means, ``at_bounds`` the share of them within 0.001 of a bound, ``noise`` the
+standard deviation of those it draws. ``drift_K`` is the root mean square by which what it means
+changes in K more updates on the same transitions. Rows are appended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data.tensor_specs import ContinuousBox
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_etl.command_line import one_sentence
+from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.sac import SACStage
+
+OBSERVATIONS, NEWEST, DRAWS = 1000, 4000, 20
+UPDATES = (10, 50, 200, 1000)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--out", type=Path, help="CSV file to append to")
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        with one_sentence(ValueError, OSError):
+            config = resumed_config(run, ["compile=false"])
+            experiment = Experiment(config, resume=run)
+            stage = experiment.learned()  # or a clear sentence; then all that it has collected
+        checkpoints = experiment.folder.checkpoints(stage.name)
+        Checkpoints(checkpoints, keep_last=2).load_newest_whole(stage.checkpoint())
+        space = experiment.spec.full_action_spec_unbatched["action"].space
+        of_run = json.loads((run / "versions.json").read_text())[-1]["commit"]
+        row = {"task": config.env, "method": config.method.name, "seed": config.seed}
+        row |= {"frames": stage.frames, "run_commit": of_run, **measured(stage, space)}
+        row |= {key: facts()[key] for key in ("commit", "machine")}
+        print(json.dumps(row))
+        if arguments.out:
+            append(arguments.out, row)
+
+
+def measured(stage: SACStage, space: ContinuousBox) -> dict[str, float]:
+    torch.manual_seed(0)
+    rows = stage.newest(NEWEST)["observation"]
+    seen = rows[torch.randperm(len(rows))[:OBSERVATIONS]]
+    policy = stage.policy_of(stage.from_raw(stage.actor))
+
+    @torch.no_grad()
+    def muscles(kind: ExplorationType = ExplorationType.DETERMINISTIC) -> Tensor:
+        with set_exploration_type(kind):
+            action = policy(TensorDict({"observation": seen}, [len(seen)]))["action"]
+        return 2 * (action - space.low) / (space.high - space.low) - 1
+
+    meant = muscles()
+    drawn = torch.stack([muscles(ExplorationType.RANDOM) for _ in range(DRAWS)])
+    found = {
+        "mean_size": size(meant),
+        "at_bounds": (meant.abs() > 0.999).float().mean().item(),
+        "noise": size(drawn.std(0)),
+    }
+    made = 0
+    for updates in UPDATES:
+        for _ in range(updates - made):
+            stage.update()
+        made = updates
+        found[f"drift_{updates}"] = size(muscles() - meant)
+    return {key: round(value, 4) for key, value in found.items()}
+
+
+def size(values: Tensor) -> float:
+    return values.square().mean().sqrt().item()
+
+
+def append(out: Path, row: dict[str, Any]) -> None:
+    fresh = not out.exists()
+    with out.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, row, lineterminator="\n")
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+if __name__ == "__main__":
+    main()
