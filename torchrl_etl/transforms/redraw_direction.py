@@ -36,8 +36,7 @@ class RedrawDirection(Transform):
 
     Raises:
         ValueError: if the share lies outside of [0, 1].
-        NotImplementedError: in an environment, where :class:`DirectionPrimer` is the one that
-            draws.
+        RuntimeError: in an environment, where :class:`DirectionPrimer` is the one that draws.
 
     Examples:
         >>> import torch
@@ -73,7 +72,7 @@ class RedrawDirection(Transform):
         return tensordict.set(key, direction).set(unravel_key(("next", key)), direction.clone())
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        raise NotImplementedError(
+        raise RuntimeError(
             "RedrawDirection is for transitions that are sampled: append it to a replay buffer; "
             "in an environment DirectionPrimer draws directions."
         )
