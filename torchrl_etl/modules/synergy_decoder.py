@@ -78,8 +78,8 @@ class SynergyDecoder(SynergyMap):
 
     With ``residual=ρ > 0`` the synergy key has d + n entries; the last n are a raw action in
     [-1, 1]^n that moves each muscle, from the middle of its range by at most ρ of its half. It is
-    added before the bounds (:func:`~torchrl_etl.functional.tanh_sum`): from ρ = 1 on every action
-    is within reach of all coefficients.
+    added before the bounds (:func:`~torchrl_etl.functional.tanh_sum`), so that with ρ = 1 every
+    action is within reach of all coefficients.
 
     Equation: a = Dec(z^a) of section 4.2.
 
