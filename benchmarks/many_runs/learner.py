@@ -22,6 +22,7 @@ from torchrl_etl.functional import (
     tanh_sum_log_slope,
 )
 from torchrl_etl.modules import RunningNorm, SynergyDecoder
+from torchrl_etl.modules.synergy_decoder import INSIDE
 from torchrl_etl.training.stage import entropy_target
 
 from .initial import initial_weights
@@ -31,7 +32,6 @@ from .settings import Settings, Shape
 __all__ = ["Learner"]
 
 SMALLEST_STD = 0.01
-INSIDE = 1.0 - 1e-4  # the bounds that synergies alone keep to, as in SynergyDecoder
 
 
 class Learner:

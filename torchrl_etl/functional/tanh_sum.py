@@ -24,7 +24,8 @@ def tanh_sum(x: Tensor, y: Tensor) -> Tensor:
         >>> tanh_sum(torch.tensor([0.0, 0.5, 0.9]), torch.tensor([0.5, 0.5, -0.9]))
         tensor([0.5000, 0.8000, 0.0000])
     """
-    return (x + y) / (1 + x * y)
+    above, below = _sides(x, y)
+    return (above - below) / (above + below)
 
 
 def tanh_sum_log_slope(x: Tensor, y: Tensor) -> Tensor:
@@ -44,4 +45,13 @@ def tanh_sum_log_slope(x: Tensor, y: Tensor) -> Tensor:
         >>> tanh_sum_log_slope(torch.tensor([0.0, 0.5]), torch.tensor([0.5, 0.0]))  # 0, ln 0.75
         tensor([ 0.0000, -0.2877])
     """
-    return (1 - x.square()).log() - 2 * (1 + x * y).log()
+    above, below = _sides(x, y)
+    return ((1 - x) * (1 + x)).log() - 2 * ((above + below) / 2).log()
+
+
+def _sides(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """(1 + x)(1 + y) and (1 - x)(1 - y): x + y and 1 + xy are halves of their difference and sum.
+
+    None of these is negative, so that rounding leads to no sum beyond the bounds.
+    """
+    return (1 + x) * (1 + y), (1 - x) * (1 - y)

@@ -17,8 +17,8 @@ from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
 
 __all__ = ["SynergyDecoder", "SynergyMap"]
 
-# In single precision a tanh reaches 1, from where no residual leads back.
-_INSIDE = 1.0 - 1e-4
+# Where synergies alone end: in single precision a tanh reaches 1, whence no residual leads back.
+INSIDE = 1.0 - 1e-6
 
 
 class _ScaledDecoder(nn.Module):
@@ -40,7 +40,7 @@ class _ScaledDecoder(nn.Module):
         """What synergies and residual add to an action, [*, n] each, where bounds are [-1, 1]."""
         synergy, residual = synergy.split([self.decoder.latent_dim, self.decoder.action_dim], -1)
         base = self.decoder.unit(self.center + self.scale * synergy)
-        return _INSIDE * base, self.residual * residual
+        return INSIDE * base, self.residual * residual
 
 
 class SynergyMap(TensorDictModule):
