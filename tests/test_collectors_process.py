@@ -21,6 +21,7 @@ from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import make_actor
+from torchrl_etl.training.sac import episodes
 
 FRAMES = 48
 
@@ -106,6 +107,22 @@ def test_async_workers_take_new_weights(start, policy):
         batch = batches.next()
     assert batch["action"].allclose(torch.tensor(0.25))
     assert batch.shape == (4, FRAMES // 4)
+
+
+@pytest.mark.slow
+def test_the_number_of_an_episode_tells_which_return_a_batch_of_any_worker_goes_on_with(start):
+    batches = start("async", num_workers=2, frames_per_batch=4 * 7)  # episodes end within batches
+    returns: dict[int, float] = {}
+    for _ in range(12):
+        batch = batches.next()
+        rewards, sums = batch["next", "reward"], batch["next", "episode_reward"]
+        rows = zip(episodes(batch), rewards, sums, strict=True)
+        for simulator in rows:
+            for number, reward, so_far in zip(*simulator, strict=True):
+                before = returns.get(int(number), 0.0)
+                returns[int(number)] = before + float(reward)
+                assert returns[int(number)] == pytest.approx(float(so_far), abs=1e-4)
+    assert len(returns) > 8  # simulators
 
 
 @pytest.mark.slow

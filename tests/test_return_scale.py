@@ -29,6 +29,25 @@ def test_scale_is_the_deviation_of_the_running_returns_or_their_largest_over_the
     torch.testing.assert_close(seen(2.0)(REWARD), REWARD / 4)
 
 
+def test_an_episode_goes_on_with_its_sum_whichever_simulators_come_in_between():
+    scale = ReturnScale(0.5, bound=1e-3)  # the largest sum decides
+    going = torch.zeros(1, 2, dtype=torch.bool)
+    scale.update(torch.tensor([[4.0, 4.0]]), going, torch.tensor([[7, 7]]))  # 4 and 6
+    assert scale.largest == 6.0
+    scale.update(torch.tensor([[-6.0, 0.0]]), going, torch.tensor([[8, 8]]))  # not -6 + 3
+    scale.update(torch.tensor([[4.0, 0.0]]), going, torch.tensor([[7, 7]]))  # 4 + 6 / 2
+    assert scale.largest == 7.0
+    assert scale.mean == (4 + 6 - 6 - 3 + 7 + 3.5) / 6
+
+
+def test_a_new_episode_of_the_same_simulator_begins_at_zero():
+    scale = ReturnScale(0.5)
+    ends = torch.tensor([[False, True]])
+    scale.update(torch.tensor([[2.0, 2.0]]), ends, torch.tensor([[7, 7]]))
+    scale.update(torch.tensor([[2.0, 2.0]]), ends, torch.tensor([[9, 9]]))
+    assert scale.mean == (2 + 3 + 2 + 3) / 4
+
+
 def test_forgetting_begins_new_episodes_and_keeps_the_scale():
     scale = seen(2.0)
     scale.forget()

@@ -13,8 +13,8 @@ __all__ = ["ReturnScale"]
 class ReturnScale(RunningMoments):
     """Divides rewards so that returns deviate by about one and stay within a bound.
 
-    Per simulator it follows the discounted sum of the rewards so far, G_t = r_t + γ G_{t-1}, zero
-    where an episode begins. The scale is max(std(G), max|G| / bound) over all that was seen.
+    Per episode it follows the discounted sum of the rewards so far, G_t = r_t + γ G_{t-1}, zero
+    where it begins. The scale is max(std(G), max|G| / bound) over all that was seen.
 
     Equation: the reward scaling of FlashSAC (2026); the first term is that of Engstrom 2020.
 
@@ -48,18 +48,28 @@ class ReturnScale(RunningMoments):
 
     def forget(self) -> None:
         """All episodes begin anew; what was seen of earlier ones stays in the scale."""
-        self._sums: Tensor | None = None
+        self._sums: dict[int, float] = {}
 
     @torch.no_grad()
-    def update(self, reward: Tensor, done: Tensor) -> None:
-        """See a batch [simulators, time], the same simulators in the same order every time."""
+    def update(self, reward: Tensor, done: Tensor, episode: Tensor | None = None) -> None:
+        """See a batch [simulators, time].
+
+        Args:
+            reward, done (Tensor): of each step, [simulators, time].
+            episode (Tensor, optional): a number for the episode of each step, [simulators, time],
+                by which the next batch that holds it goes on with its sum, whichever simulators
+                are in between. Default: all batches have the same simulators in the same order.
+        """
         reward = reward.to(self.mean)
-        sums = self._sums if self._sums is not None else torch.zeros_like(reward[:, 0])
+        if episode is None:
+            episode = torch.arange(len(reward)).unsqueeze(1)
+        sums = reward.new_tensor([self._sums.pop(name, 0.0) for name in episode[:, 0].tolist()])
         seen = []
         for now, ends in zip(reward.unbind(1), done.unbind(1), strict=True):
             seen.append(now + self.gamma * sums)
             sums = torch.where(ends, 0.0, seen[-1])
-        self._sums = sums
+        last = zip(episode[:, -1].tolist(), sums.tolist(), done[:, -1].tolist(), strict=True)
+        self._sums |= {name: so_far for name, so_far, ends in last if not ends}
         values = torch.stack(seen)
         self.see(values)
         self.largest.copy_(torch.maximum(self.largest, values.abs().max()))

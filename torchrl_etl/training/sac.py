@@ -226,10 +226,21 @@ class SACStage(Stage):
     def seen(self, batch: TensorDictBase) -> TensorDictBase:
         if self.return_scale is not None:
             reward = self.reward_scale * batch["next", "reward"]
-            self.return_scale.update(reward.squeeze(-1), batch["next", "done"].squeeze(-1))
+            done = batch["next", "done"]
+            self.return_scale.update(reward.squeeze(-1), done.squeeze(-1), episodes(batch))
         if self.norm is not None:
             self.norm.see(batch["observation"])
         return batch
+
+
+def episodes(batch: TensorDictBase) -> Tensor:
+    """A number for the episode of each transition [*].
+
+    Workers of one machine number theirs together, those on other machines each on their own.
+    """
+    number = batch["collector", "traj_ids"]
+    worker = batch.get(("collector", "worker"), None)
+    return number if worker is None else number + (worker << 32)
 
 
 def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
