@@ -21,7 +21,8 @@ from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.synergy_report import fit_gmvae
 

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from harness import line, recipe
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 
 
 def resident_gigabytes() -> dict[str, float]:

@@ -18,7 +18,8 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_etl.command_line import one_sentence
 from torchrl_etl.envs.simulator import simulator
-from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import resumed_config
 from torchrl_etl.training.evaluation import EVALUATION_SEED
 from torchrl_etl.training.run_folder import facts
 

@@ -12,7 +12,7 @@ import time
 from harness import recipe
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.training.stage import Stage
 
 

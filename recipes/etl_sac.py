@@ -24,7 +24,8 @@ from omegaconf import DictConfig
 from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
 from torchrl_etl.envs import SimulationError
-from torchrl_etl.training import Experiment, Interrupted, resumed_config
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import Interrupted, resumed_config
 
 CONF = Path(__file__).parent / "conf"
 SYNERGIES = (

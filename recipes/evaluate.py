@@ -22,7 +22,8 @@ from torchrl_etl.command_line import (
 )
 
 draw_without_display()
-from torchrl_etl.training import Experiment, record_episodes, resumed_config  # noqa: E402
+from torchrl_etl.experiment import Experiment  # noqa: E402
+from torchrl_etl.training import record_episodes, resumed_config  # noqa: E402
 
 CONF = Path(__file__).parent / "conf"
 

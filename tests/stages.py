@@ -7,7 +7,7 @@ from torch import nn
 
 from tests.configs import tiny
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 
 
 def explore_stage(*overrides):

@@ -18,7 +18,7 @@ from torchrl_etl.baselines.sar import SARDecoder, best_episodes
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.transforms import SynergyAction
 
 MUSCLES, SYNERGIES = 7, 3

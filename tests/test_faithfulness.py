@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tests.configs import CONF, ROOT, tiny
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.training.explore import ExploreStage
 
 PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")

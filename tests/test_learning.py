@@ -8,7 +8,8 @@ import torch
 from tests.configs import tiny
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.training import Experiment, fit_gmvae
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.synergies import fit_gmvae
 
 
 @pytest.fixture

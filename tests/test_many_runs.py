@@ -20,7 +20,7 @@ from benchmarks.many_runs.settings import Settings, Shape
 from tests.configs import ROOT, tiny
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
-from torchrl_etl.training import Experiment
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.training.evaluation import evaluate
 from torchrl_etl.training.stage import entropy_target, ready_for_training
 

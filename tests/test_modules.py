@@ -19,7 +19,7 @@ from torchrl_etl.modules import (
     make_critic,
 )
 from torchrl_etl.objectives import GMVAELoss
-from torchrl_etl.training import fit_gmvae
+from torchrl_etl.synergies import fit_gmvae
 
 LOW, HIGH = [0.0, -1.0, -3.0, 0.1], [1.0, 1.0, 5.0, 0.7]
 BOUNDS = [(0.0, 1.0), (-1.0, 1.0), (LOW, HIGH)]

@@ -11,7 +11,8 @@ from tests.configs import CONF, tiny
 from torchrl_etl.envs import list_tasks
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.training import Experiment, resumed_config, validate
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import resumed_config, validate
 
 GROUPS = {
     name: sorted(p.stem for p in (CONF / name).glob("*.yaml"))

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 
 from tests.configs import CONF, tiny
 from tests.test_training_resume import numbers
-from torchrl_etl.training import Experiment, resumed_config
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.methods import PlayStage
 

@@ -18,7 +18,8 @@ import torch
 
 from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.training import Experiment, Interrupted, resumed_config
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.stage import Stage

@@ -13,7 +13,8 @@ from tests.configs import tiny
 from tests.stages import changed, explore_stage, fill, learn_stage, snapshot
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.training import Experiment, fit_gmvae
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.synergies import fit_gmvae
 
 
 def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_updates(tmp_path):

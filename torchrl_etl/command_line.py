@@ -13,7 +13,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.checks import check_choice
 
 __all__ = [
     "check_overrides",

@@ -13,12 +13,15 @@ from torchrl_etl.analysis.diagnostics import (
 )
 from torchrl_etl.analysis.pictures import embedding, learning_curves, synergy_heatmap, vaf_curve
 from torchrl_etl.analysis.statistics import Interval, interval, success_interval
+from torchrl_etl.analysis.synergy_report import describe_synergies, draw_synergies
 
 __all__ = [
     "Interval",
     "MixtureUsage",
     "control_authority",
+    "describe_synergies",
     "direction_alignment",
+    "draw_synergies",
     "embedding",
     "interval",
     "learning_curves",

@@ -25,7 +25,7 @@ from torchrl_etl.analysis.bench_statistics import (
 )
 from torchrl_etl.analysis.published import caveats, environment_id, published_curves
 from torchrl_etl.analysis.statistics import Interval
-from torchrl_etl.modules.atomic_files import write_atomically
+from torchrl_etl.io import write_atomically
 
 __all__ = ["write_report"]
 

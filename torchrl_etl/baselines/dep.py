@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 
 __all__ = ["DEPController", "DEPExploration"]
 

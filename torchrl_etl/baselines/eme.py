@@ -21,7 +21,7 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl import functional
-from torchrl_etl.modules.checks import check_choice, check_positive
+from torchrl_etl.checks import check_choice, check_positive
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 

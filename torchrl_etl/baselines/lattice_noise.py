@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.baselines.lattice import LatticeNetwork, StateDependentSpread
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 
 __all__ = ["LatticeNoise"]
 

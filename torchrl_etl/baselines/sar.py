@@ -10,7 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 from torchrl_etl.modules.synergy_decoder import SynergyMap
 
 __all__ = ["SARDecoder", "best_episodes"]

@@ -5,11 +5,13 @@ import gymnasium
 from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.envs.factory import actuator_names, make_env
 from torchrl_etl.envs.simulator import mujoco_state
+from torchrl_etl.envs.spec import EnvironmentSpec
 from torchrl_etl.envs.tasks import Task, episode_length, list_tasks, resolve_task
 from torchrl_etl.envs.wrappers import SimulationError
 
 __all__ = [
     "AnalyticOveractuated",
+    "EnvironmentSpec",
     "SimulationError",
     "Task",
     "actuator_names",

@@ -6,7 +6,7 @@ from torchrl_etl.modules.held_noise import HeldNoise
 from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
-from torchrl_etl.modules.synergy_decoder import SynergyDecoder
+from torchrl_etl.modules.synergy_decoder import SynergyDecoder, SynergyMap
 from torchrl_etl.modules.unit_rows import normalize_rows
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "RunningNorm",
     "StateEncoder",
     "SynergyDecoder",
+    "SynergyMap",
     "make_actor",
     "make_critic",
     "normalize_rows",

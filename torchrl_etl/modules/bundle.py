@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_etl.modules.atomic_files import replace_folder, surviving_folder
+from torchrl_etl.io import replace_folder, surviving_folder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 
 __all__ = ["BundleError", "BundleInfo", "check_compatible", "load_bundle", "save_bundle"]

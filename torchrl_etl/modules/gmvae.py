@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP
 
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 
 __all__ = ["GMVAE", "ActionDecoder", "Posterior"]
 

@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 
 __all__ = ["GaussianDynamics", "StateEncoder"]
 

@@ -26,5 +26,7 @@ def normalize_rows(weights: Iterable[Tensor]) -> None:
                 [0.0000, 1.0000]])
     """
     weights = list(weights)
+    if not weights:
+        return
     lengths = [weight.norm(dim=-1, keepdim=True).clamp_min(1e-8) for weight in weights]
     torch._foreach_div_(weights, lengths)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.checks import check_choice
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 

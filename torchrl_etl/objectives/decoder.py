@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl.functional import reconstruction_loss
-from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.checks import check_choice
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["DecoderLoss"]

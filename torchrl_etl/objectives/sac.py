@@ -19,7 +19,7 @@ from torchrl_etl.functional import (
     categorical_mean,
     project_categorical,
 )
-from torchrl_etl.modules.checks import check_choice
+from torchrl_etl.checks import check_choice
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["LeanSACLoss", "call"]

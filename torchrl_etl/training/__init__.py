@@ -1,25 +1,21 @@
-"""The two stages, the loop around them, checkpoints and evaluation."""
+"""What runs a learner: a stage, the loop around it, checkpoints, evaluation, queues of runs."""
 
 from torchrl_etl.training.bench import Bench, Run
 from torchrl_etl.training.config import resumed_config, validate
+from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
-from torchrl_etl.training.experiment import Experiment
-from torchrl_etl.training.explore import ExploreStage
-from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.loop import Interrupted
-from torchrl_etl.training.synergy_report import fit_gmvae
+from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.video import record_episodes
 
 __all__ = [
     "Bench",
+    "Context",
     "Evaluation",
-    "Experiment",
-    "ExploreStage",
     "Interrupted",
-    "LearnStage",
     "Run",
+    "Stage",
     "evaluate",
-    "fit_gmvae",
     "record_episodes",
     "resumed_config",
     "validate",

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
 from torchrl_etl.analysis.bench_results import COLUMNS, RESULTS
-from torchrl_etl.modules.atomic_files import write_atomically
+from torchrl_etl.io import write_atomically
 from torchrl_etl.training.run_folder import RunFolder
 
 __all__ = ["Bench", "Run"]

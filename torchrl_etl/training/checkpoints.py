@@ -12,7 +12,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-from torchrl_etl.modules.atomic_files import write_atomically
+from torchrl_etl.io import write_atomically
 
 __all__ = ["Checkpoints"]
 

@@ -1,228 +1,109 @@
-"""What a configuration must satisfy before anything is built."""
+"""What a configuration must satisfy that no part of a run checks for itself."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, get_args
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
-from torchrl_etl.modules.actor_critic import Body
-from torchrl_etl.modules.checks import check_choice
-from torchrl_etl.training.methods import METHODS
 
-__all__ = ["resumed_config", "validate"]
+__all__ = ["MAY_CHANGE", "RENAMED", "resumed_config", "validate"]
 
-_CHOICES = {
-    "collector.kind": COLLECTORS,
-    "method.learner": ("etl", *METHODS),
-    "stage": ("explore", "learn", "all"),
-    "explore.fit.actions": ("policy", "mean", "sampled", "activation"),
-    "explore.representation": ("metric", "metra"),
-    "explore.buffer_storage": ("memory", "memmap"),
-    "learn.buffer_storage": ("memory", "memmap"),
-    "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
-    "learn.sac.noise": ("independent", "held"),
-    **{
-        f"{section}{network}.body": get_args(Body)
-        for section in ("", "explore.", "learn.")
-        for network in ("actor", "critic")
-    },
-}
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
 
+RENAMED = {
+    "explore.updates_per_frame": "explore.replay_ratio",
+    "explore.redraw": "exploration.relabel",
+    "explore.representation": "exploration=metra",
+    "explore.encoder": "exploration.encoder",
+    "explore.encoder_lr": "exploration.lr",
+    "explore.encoder_tau": "exploration.tau",
+    "explore.direction": "exploration.direction",
+    "explore.bonus": "exploration.bonus",
+    "explore.metric": "exploration.metric",
+    "explore.metra": "exploration.metra",
+    "explore.gmvae": "synergies",
+    "explore.fit.lr": "synergies.lr",
+    "explore.fit.kl_weight": "synergies.kl_weight",
+    "explore.fit.component_kl_weight": "synergies.component_kl_weight",
+    "learn.updates_per_frame": "learn.replay_ratio",
+    "learn.fine_tuning": "learn.decoder.fine_tuning",
+    "learn.decoder_lr": "learn.decoder.lr",
+    "learn.anchor": "learn.decoder.distillation_weight",
+    "learn.residual": "learn.decoder.residual",
+    "learn.reuse_exploration": "learn.prefill",
+    "learn.sac.actor_average": "learn.sac.ema_decay",
+    "learn.sac.n_steps": "learn.n_steps",
+    "learn.sac.noise": "learn.noise.kind",
+    "learn.sac.hold": "learn.noise",
+}
+"""Settings by their names of before, and what they are called now."""
 
-def _both(*keys: str) -> tuple[str, ...]:
-    return tuple(f"{stage}.{key}" for stage in ("explore", "learn") for key in keys)
-
-
-def _integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _real(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _widths(value: Any) -> bool:
-    return (
-        isinstance(value, ListConfig) and bool(value) and all(_integer(w) and w > 0 for w in value)
-    )
-
-
-# What is expected, in words; whether a value is that; the keys that must be.
-_Rule = tuple[str, Callable[[Any], bool], tuple[str, ...]]
-_RULES: tuple[_Rule, ...] = (
-    ("a text", lambda v: isinstance(v, str) and v != "", ("env", "run_dir", "device")),
-    (
-        "true or false",
-        lambda v: isinstance(v, bool),
-        (
-            "progress",
-            "pictures",
-            "collector.ahead",
-            "learn.reuse_exploration",
-            "learn.sac.normalize_observations",
-            "learn.sac.unit_rows",
-            "explore.bonus.normalize",
-            "explore.metric.delay_encoder",
-            "actor.layer_norm",
-            "critic.layer_norm",
-            *_both("actor.layer_norm", "critic.layer_norm"),
-        ),
+MAY_CHANGE = (
+    *("frames", "stage", "device", "threads", "compile", "log", "logger_kwargs", "log_every"),
+    *("progress", "pictures", "vaf_curve", "evaluation", "checkpoint", "ray", "distributed"),
+    *(f"collector.{key}" for key in ("kind", "ahead", "timeout", "num_workers")),
+    *(
+        f"{stage}.{key}"
+        for stage in ("explore", "learn")
+        for key in ("frames", "batch_size", "replay_ratio", "buffer_size", "buffer_storage")
     ),
-    ("true, false or null", lambda v: v is None or isinstance(v, bool), ("compile",)),
-    (
-        "a whole number above 0",
-        lambda v: _integer(v) and v > 0,
-        (
-            "num_synergies",
-            "action_repeat",
-            "collector.num_envs",
-            "collector.num_workers",
-            "collector.frames_per_batch",
-            "log_every",
-            "evaluation.episodes",
-            "checkpoint.every",
-            "vaf_curve.updates",
-            "explore.encoder.embedding_dim",
-            "learn.critic.bins",
-            "learn.sac.hold.longest",
-            "learn.sac.n_steps",
-            "learn.sac.num_critics",
-            *_both("frames"),
-        ),
-    ),
-    (
-        "a whole number above 1",
-        lambda v: _integer(v) and v > 1,
-        ("checkpoint.keep", *_both("batch_size", "buffer_size")),
-    ),
-    (
-        "a whole number from 0 to 2147483647",
-        lambda v: _integer(v) and 0 <= v < 2**31,
-        ("seed", "evaluation.every", "explore.fit.final_updates", *_both("learning_starts")),
-    ),
-    (
-        "a whole number above 0 or null",
-        lambda v: v is None or (_integer(v) and v > 0),
-        ("frames", "threads", "explore.gmvae.num_components", "explore.direction.num_directions"),
-    ),
-    (
-        "a number above 0",
-        lambda v: _real(v) and 0 < v < 1e9,
-        (
-            "collector.timeout",
-            "explore.encoder_lr",
-            "explore.metra.epsilon",
-            "explore.metra.lambda_init",
-            "explore.fit.lr",
-            "learn.decoder_lr",
-            "learn.sac.hold.exponent",
-            "explore.metric.epsilon",
-            "explore.metric.margin",
-            *_both("updates_per_frame", "reward_scale"),
-            *_both("sac.lr", "sac.alpha_init"),
-        ),
-    ),
-    (
-        "a number above 0 or null",
-        lambda v: v is None or (_real(v) and v > 0),
-        (*_both("sac.action_std"), "learn.sac.return_bound"),
-    ),
-    (
-        "a number 0 or more",
-        lambda v: _real(v) and v >= 0,
-        (
-            "learn.anchor",
-            "explore.metric.weight",
-            "explore.bonus.extrinsic_weight",
-            "explore.fit.kl_weight",
-            "explore.fit.component_kl_weight",
-        ),
-    ),
-    (
-        "a share in (0, 1]",
-        lambda v: _real(v) and 0 < v <= 1,
-        ("explore.fit.best_share", "explore.encoder_tau", *_both("sac.tau")),
-    ),
-    (
-        "a share in [0, 1]",
-        lambda v: _real(v) and 0 <= v <= 1,
-        ("explore.redraw", "learn.residual", "learn.sac.lr_end"),
-    ),
-    (
-        "a share in [0, 1)",
-        lambda v: _real(v) and 0 <= v < 1,
-        (
-            "explore.bonus.decay",
-            "explore.metric.gamma",
-            "learn.sac.actor_average",
-            *_both("sac.gamma"),
-        ),
-    ),
-    (
-        "a list of whole numbers above 0",
-        _widths,
-        (
-            "actor.hidden",
-            "critic.hidden",
-            "explore.encoder.hidden",
-            "explore.gmvae.hidden",
-            "vaf_curve.dims",
-            *_both("actor.hidden", "critic.hidden"),
-        ),
-    ),
+    *("learn.sac.lr", "learn.sac.lr_end", "learn.decoder.lr", "explore.sac.lr"),
 )
+"""Settings and sections that a resumed run may have otherwise than its checkpoints."""
 
 
 def validate(config: DictConfig) -> None:
-    """Check a configuration; the first fault raises one sentence that says how to mend it.
+    """Check what concerns the run as a whole; the first fault raises one sentence.
+
+    What concerns a part is checked by its constructor, before the first frame.
 
     Raises:
         ValueError: naming the key, what came and what is expected.
     """
-    for words, holds, keys in _RULES:
-        for key in keys:
-            value = OmegaConf.select(config, key)
-            if not holds(value):
-                raise ValueError(f"{key} is {value!r}; it must be {words}.")
-    for key, choices in _CHOICES.items():
-        check_choice(key, OmegaConf.select(config, key), choices)
+    for name in ("env", "run_dir", "device"):
+        if not isinstance(config[name], str) or not config[name]:
+            raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
+    check_flag(
+        progress=config.progress,
+        pictures=config.pictures,
+        **{"learn.prefill": config.learn.prefill, "collector.ahead": config.collector.ahead},
+    )
+    if config.compile is not None:
+        check_flag(compile=config.compile)
+    for name in ("frames", "threads"):
+        if config[name] is not None:
+            check_integer(1, **{name: config[name]})
+    check_integer(0, seed=config.seed, **{"evaluation.every": config.evaluation.every})
+    if config.seed >= 2**31:
+        raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
+    check_integer(
+        1,
+        num_synergies=config.num_synergies,
+        action_repeat=config.action_repeat,
+        log_every=config.log_every,
+        **{
+            key: OmegaConf.select(config, key)
+            for key in (
+                *("collector.num_envs", "collector.num_workers", "collector.frames_per_batch"),
+                *("evaluation.episodes", "checkpoint.every", "vaf_curve.updates"),
+                *("explore.frames", "learn.frames"),
+            )
+        },
+    )
+    check_integer(2, **{"checkpoint.keep": config.checkpoint.keep})
+    check_integer(0, **{"explore.fit.final_updates": config.explore.fit.final_updates})
+    check_real("(0, inf)", **{"collector.timeout": config.collector.timeout})
+    check_choice("stage", config.stage, ("explore", "learn", "all"))
+    check_choice("collector.kind", config.collector.kind, COLLECTORS)
     resolve_task(config.env, config.goal)
     _check_collector(config.collector)
-    if config.method.learner != "etl" and (config.stage != "all" or config.synergies is not None):
-        raise ValueError(
-            f"method={config.method.name} has one stage and no synergies; leave stage and "
-            "synergies out."
-        )
-    if config.learn.critic.bins > 1 and config.learn.sac.return_bound is None:
-        raise ValueError(
-            f"learn.critic.bins is {config.learn.critic.bins}, which needs a bound on returns; "
-            "give learn.sac.return_bound=5 or the like."
-        )
-    fit = config.explore.fit
-    if fit.best_share < 1 and fit.actions == "policy":
-        raise ValueError(
-            f"explore.fit.best_share is {fit.best_share}, a share by reward, but the actions of "
-            "explore.fit.actions=policy are such as nobody took; use explore.fit.actions=mean."
-        )
-    if config.stage == "learn" and config.synergies is None:
-        raise ValueError(
-            "stage=learn needs synergies=PATH, the run folder or bundle of an earlier exploration; "
-            "use stage=all to explore first."
-        )
-    if config.stage == "explore" and config.synergies is not None:
-        raise ValueError(
-            f"stage=explore finds synergies, but synergies={config.synergies} was given; leave it "
-            "out or use stage=learn."
-        )
     _check_loggers(config.log)
     _check_device(config.device)
 
@@ -242,31 +123,14 @@ def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
     given = [override for override in overrides if not override.startswith("resume=")]
     for override in given:
         key = override.partition("=")[0].lstrip("+~")
-        if key in _FIXED or any(part in key.split(".") for part in _FIXED_SECTIONS):
+        if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in MAY_CHANGE):
             raise ValueError(
                 f"{key} cannot be changed when a run is resumed, since its checkpoints were made "
-                "with another; start a new run for that."
+                f"with another; start a new run for that. What may change: {', '.join(MAY_CHANGE)}."
             )
     config = OmegaConf.load(path)
     OmegaConf.set_struct(config, True)
     return OmegaConf.merge(config, OmegaConf.from_dotlist(given))
-
-
-# What the shapes of networks, or the meaning of their weights, depend on.
-_FIXED = ("env", "goal", "action_repeat", "seed", "num_synergies", "synergies", "run_dir")
-_FIXED += ("learn.sac.num_critics", "learn.residual", "learner", "experiment", "faithful")
-_FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
-_FIXED_SECTIONS = (
-    "method",
-    "actor",
-    "critic",
-    "encoder",
-    "gmvae",
-    "direction",
-    "metric",
-    "metra",
-    "representation",
-)
 
 
 def _check_collector(collector: DictConfig) -> None:

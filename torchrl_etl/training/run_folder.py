@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
-from torchrl_etl.modules.atomic_files import write_atomically
+from torchrl_etl.io import write_atomically
 
 __all__ = ["RunFolder", "facts"]
 

@@ -1,52 +1,44 @@
-"""What both stages share: a collector, a buffer, and an update that is owed per frame."""
+"""A stage of a run: a collector fills a buffer, a learner draws batches from it."""
 
 from __future__ import annotations
 
 import gc
 import math
 import shutil
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torch.optim import Adam, Optimizer
+from tensordict.utils import NestedKey
+from torch import nn
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
-from torchrl.data import (
-    Bounded,
-    LazyMemmapStorage,
-    LazyTensorStorage,
-    Storage,
-    TensorDictReplayBuffer,
-)
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, Storage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.envs.transforms import Transform
 
+from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, make_batches
 from torchrl_etl.collectors.seeds import training_seed
-from torchrl_etl.objectives import FusedSoftUpdate
+from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
-from torchrl_etl.training.compiled import compiled, cuda_graph
+from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
 
-__all__ = [
-    "Progress",
-    "Stage",
-    "entropy_target",
-    "gradient_step",
-    "make_optimizer",
-    "ready_for_training",
-]
+__all__ = ["Progress", "Stage"]
+
+TRANSITION = (
+    "observation",
+    "action",
+    *(("next", key) for key in ("observation", "reward", "done", "terminated")),
+)
 
 
 class Progress:
     """Counters of a stage, saved with it.
 
-    ``owed`` is the fraction of an update that the frames so far have earned but not yet had;
+    ``owed`` is the number of updates that the frames so far have earned but not yet had;
     ``seconds`` is the wall time that the stage took, over all its starts.
     """
 
@@ -61,102 +53,89 @@ class Progress:
         vars(self).update(state)
 
 
-class Stage(ABC):
-    """One stage of ETL: collect a batch, keep it, update as often as its frames have earned.
+class Stage:
+    """Collects with a learner's behavior policy and updates it as often as its frames have earned.
 
     Args:
+        name (str): of its logs and its checkpoints.
+        learner (SACLearner): what learns; its ``behavior`` collects.
         make_env (callable): environment to collect from, transforms included.
-        policy (TensorDictModuleBase): acts in it; its weights are shared with the losses.
 
     Keyword Args:
         frames (int): budget of the stage, in environment frames.
         seed (int): seed of the stage.
-        device (torch.device): where networks and buffer live.
-        buffer_size (int): transitions to keep; never more than the budget are allocated.
-        buffer_storage (str): "memory" keeps them on the device, "memmap" in files.
-        scratch (path): folder for these files, which are deleted when the stage is closed.
-        batch_size (int): transitions in an update.
+        device (torch.device): where the buffer lives.
+        scratch (path): folder for the files of a ``"memmap"`` buffer; they are deleted when the
+            stage is closed.
         collector (mapping): arguments of :func:`~torchrl_etl.collectors.make_batches`.
-        action_repeat (int): frames that a transition of the collector takes. Default: 1.
-        updates_per_frame (float): updates per collected frame.
+        buffer_size (int): transitions to keep, 2 or more; never more than the budget are allocated.
+        buffer_storage (str): "memory" keeps them on the device, "memmap" in files.
+        batch_size (int): transitions in an update, 2 or more.
+        replay_ratio (float): updates per frame.
         learning_starts (int): frames before the first update.
-        reward_scale (float): factor on the task's reward as the buffer keeps it.
-        given (int): transitions to make room for beside the budget. Default: 0.
-        compile (bool): compile updates; on CUDA they also become one CUDA graph.
-            Default: ``False``.
-    """
+        reward_scale (float): factor on the task's reward, before anything else reads it.
+        n_steps (int): rewards in a critic's target before it bootstraps, fewer at the end of an
+            episode. Intermediate steps get no entropy bonus. Default: 1.
+        keep (sequence of NestedKey): further entries of a transition for the buffer.
+        transforms (sequence of Transform): what each sampled batch goes through.
+        prefill_size (int): transitions to make room for beside the budget. Default: 0.
+        action_repeat (int): frames that a transition of the collector takes. Default: 1.
 
-    name: str
-    optimizer: Adam
-    targets: Sequence[SoftUpdate]
+    Raises:
+        ValueError: naming the argument that cannot be used.
+    """
 
     def __init__(
         self,
+        name: str,
+        learner: SACLearner,
         make_env: Callable[[], EnvBase],
-        policy: TensorDictModuleBase,
         *,
-        collector: Mapping[str, Any],
         frames: int,
         seed: int,
         device: torch.device,
+        scratch: Path,
+        collector: Mapping[str, Any],
         buffer_size: int,
         buffer_storage: Literal["memory", "memmap"],
-        scratch: Path,
         batch_size: int,
-        updates_per_frame: float,
+        replay_ratio: float,
         learning_starts: int,
         reward_scale: float,
+        n_steps: int = 1,
+        keep: Sequence[NestedKey] = (),
+        transforms: Sequence[Transform] = (),
+        prefill_size: int = 0,
         action_repeat: int = 1,
-        given: int = 0,
-        compile: bool = False,
     ) -> None:
-        self.policy, self.seed, self.device = policy, seed, device
-        self.reward_scale = reward_scale
-        self.budget = frames
-        self.action_repeat = action_repeat
-        self._make_batches = partial(
-            make_batches, **collector, make_env=make_env, policy=policy, device=device
-        )
-        self.updates_per_frame, self.learning_starts = updates_per_frame, learning_starts
+        check_integer(1, frames=frames, n_steps=n_steps)
+        check_integer(2, batch_size=batch_size, buffer_size=buffer_size)
+        check_integer(0, learning_starts=learning_starts)
+        check_real("(0, inf)", replay_ratio=replay_ratio, reward_scale=reward_scale)
+        check_choice("buffer_storage", buffer_storage, ("memory", "memmap"))
+        self.name, self.learner, self.seed, self.device = name, learner, seed, device
+        self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
+        self.replay_ratio, self.learning_starts = replay_ratio, learning_starts
         self.progress = Progress()
+        self.batches: Batches | None = None
+        self._make_batches = partial(
+            make_batches, **collector, make_env=make_env, policy=learner.behavior, device=device
+        )
+        per_batch = collector["frames_per_batch"]
+        self._most_updates = math.ceil(2 * replay_ratio * action_repeat * per_batch)
+        room = min(buffer_size, prefill_size + frames // action_repeat + per_batch)
         self.buffer = TensorDictReplayBuffer(
-            storage=make_storage(
-                min(buffer_size, given + frames // action_repeat + collector["frames_per_batch"]),
-                device,
-                scratch / self.name if buffer_storage == "memmap" else None,
-            ),
+            storage=make_storage(room, device, scratch / name if buffer_storage == "memmap" else None),
             batch_size=batch_size,
         )
-        batch_frames = action_repeat * collector["frames_per_batch"]
-        self._most_updates = math.ceil(2 * updates_per_frame * batch_frames)
-        self.batches: Batches | None = None
-        self._gradients = compiled(self.gradients) if compile else self.gradients
-        graphed = compile and device.type == "cuda"
-        self._step = cuda_graph(self.step) if graphed else self.step
-
-    # What a stage defines -------------------------------------------------------------------
-
-    @abstractmethod
-    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
-        """The entries of a flat batch that the buffer keeps."""
-
-    @abstractmethod
-    def losses(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """What an update on this batch minimizes, all parts summed, and the scalars to log."""
-
-    @abstractmethod
-    def parts(self) -> dict[str, Any]:
-        """Stateful parts by name (losses, optimizers, statistics) for the checkpoint."""
-
-    def seen(self, batch: TensorDictBase) -> TensorDictBase:
-        """A batch [simulators, time] as it came, once a stage has taken note of what it wants."""
-        return batch
-
-    def spanned(self, batch: TensorDictBase) -> TensorDictBase:
-        """Transitions [*] of a batch [simulators, time], over as many steps as a target spans."""
-        return batch.reshape(-1)
-
-    # What every stage does -------------------------------------------------------------------
+        self.transforms = nn.ModuleList(transforms)
+        for transform in transforms:
+            self.buffer.append_transform(transform)
+        self._kept = [*TRANSITION, *keep]
+        self.multi_step = None
+        if n_steps > 1:
+            self.multi_step = ContinuedMultiStep(learner.gamma, n_steps)
+            self._kept.append("steps_to_next_obs")
 
     @property
     def frames(self) -> int:
@@ -166,79 +145,61 @@ class Stage(ABC):
     def finished(self) -> bool:
         return self.frames >= self.budget
 
-    def restart_collection(self) -> None:
-        """Begin new episodes, seeded by the frame count.
-
-        A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
-        checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
-        """
-        seed = training_seed(self.seed, self.frames)
-        if self.batches is None:
-            # Only a run that begins or resumes builds a collector: that must not show.
-            random = GlobalRNGState().state_dict()
-            self.batches = self._make_batches(seed=seed)
-            GlobalRNGState().load_state_dict(random)
-        self.batches.restart(seed)
-
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
         batch = self.batches.next().to(self.device)
         # One simulator has no dimension of its own, and several workers have one more.
-        batch = self.seen(batch.reshape(-1, batch.shape[-1]))
-        if len(rows := self.spanned(batch)):
-            self.buffer.extend(self.transitions(rows))
-        batch = batch.reshape(-1)
+        batch = batch.reshape(-1, batch.shape[-1]).copy()
+        batch["next", "reward"] = self.reward_scale * batch["next", "reward"]
+        self.learner.observe(batch)
+        rows = batch.reshape(-1) if self.multi_step is None else self.multi_step(batch)
+        if len(rows):
+            self.buffer.extend(rows.select(*self._kept))
         self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
         if self.frames > self.learning_starts and len(self.buffer):
             self.earn(batch.numel())
-        return batch
-
-    def earn(self, transitions: int) -> None:
-        """Owe the updates that the frames of so many transitions are worth."""
-        self.progress.owed += self.action_repeat * transitions * self.updates_per_frame
+        return batch.reshape(-1)
 
     def learn(self) -> TensorDictBase | None:
         """The updates that the collected frames have earned; returns their mean scalars.
 
-        The thousands for frames that were given are made up for in parts, see :attr:`behind`.
+        The thousands that a prefilled buffer has earned are made up for in parts, see
+        :attr:`behind`.
         """
         due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
         self.progress.updates += due
         logs = [self.update() for _ in range(due)]
+        self.learner.advance(self.frames, self.frames / self.budget)
         return torch.stack(logs).mean(0) if logs else None
+
+    def update(self) -> TensorDictBase:
+        """One update on a sampled batch; returns scalars to log."""
+        return self.learner.update(self.buffer.sample().to(self.device))
+
+    def earn(self, transitions: int) -> None:
+        """Owe the updates that the frames of so many transitions are worth."""
+        self.progress.owed += self.action_repeat * transitions * self.replay_ratio
 
     @property
     def behind(self) -> bool:
         """Whether :meth:`learn` left updates for later."""
         return self.progress.owed >= 1
 
-    def update(self) -> TensorDictBase:
-        """One gradient step on every part that this stage trains; returns scalars to log."""
-        return self._step(self.buffer.sample().to(self.device))
+    def prefill(self, rows: TensorDictBase) -> None:
+        """Put transitions of another policy into the buffer; they earn updates like one's own.
 
-    def step(self, batch: TensorDictBase) -> TensorDictBase:
-        """An update on this batch."""
-        gradients, scalars = self._gradients(batch)
-        for parameter, gradient in zip(self._trained(), gradients, strict=True):
-            parameter.grad = gradient
-        self.optimizer.step()
-        self.constrain()
-        for target in self.targets:
-            target.step()
-        return scalars
-
-    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
-        """Gradients of what is trained, and the scalars to log."""
-        loss, scalars = self.losses(batch)
-        return torch.autograd.grad(loss, self._trained(), allow_unused=True), scalars.detach()
-
-    def constrain(self) -> None:  # noqa: B027 (most stages have nothing to do here)
-        """Bring parameters back to where they must lie, after every step of the optimizer."""
-
-    def _trained(self) -> list[Tensor]:
-        return [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        Their reward is the task's, unscaled.
+        """
+        rows = rows.copy()
+        rows["next", "reward"] = self.reward_scale * rows["next", "reward"]
+        if self.multi_step is not None:
+            rows["steps_to_next_obs"] = torch.ones(rows.shape, dtype=torch.long, device=rows.device)
+        if self.learner.objective.normalizer is not None:
+            self.learner.objective.normalizer.see(rows["observation"])
+        self.buffer.extend(rows.select(*self._kept))
+        self.earn(len(rows))
 
     def newest(self, count: int) -> TensorDictBase:
         """Up to ``count`` of the latest transitions, oldest first."""
@@ -247,10 +208,28 @@ class Stage(ABC):
             rows = torch.cat([rows[writer._cursor :], rows[: writer._cursor]])
         return rows[-count:]
 
+    def restart_collection(self) -> None:
+        """Begin new episodes, seeded by the frame count.
+
+        A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
+        checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
+        """
+        self.learner.restart(self.frames)
+        if self.multi_step is not None:
+            self.multi_step.forget()
+        seed = training_seed(self.seed, self.frames)
+        if self.batches is None:
+            # Only a run that begins or resumes builds a collector: that must not show.
+            random = GlobalRNGState().state_dict()
+            self.batches = self._make_batches(seed=seed)
+            GlobalRNGState().load_state_dict(random)
+        self.batches.restart(seed)
+
     def checkpoint(self) -> Checkpoint:
         """Everything the stage needs to go on, as a TorchRL checkpoint."""
-        checkpoint = Checkpoint(**self.parts(), progress=self.progress, rng=GlobalRNGState())
-        return checkpoint.register("buffer", self.buffer, adapter=BufferAdapter())
+        parts = {**self.learner.parts, "progress": self.progress, "rng": GlobalRNGState()}
+        parts["transforms"] = self.transforms  # running statistics of a bonus, say
+        return Checkpoint(**parts).register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:
         if self.batches is not None:
@@ -263,58 +242,9 @@ class Stage(ABC):
             shutil.rmtree(self.buffer.storage.scratch_dir, ignore_errors=True)
 
 
-def entropy_target(action_spec: Bounded, action_std: float | None) -> float | str:
-    """Entropy of a Gaussian with ``action_std`` per dimension, in units where the bounds are ±1.
-
-    ``None`` gives SAC's usual minus the number of dimensions ("auto").
-
-    Examples:
-        >>> from torchrl.data import Bounded
-        >>> round(entropy_target(Bounded(-1, 1, shape=(2,)), action_std=1.0), 3)  # ln(2πe)
-        2.838
-        >>> round(entropy_target(Bounded(0, 1, shape=(2,)), action_std=1.0), 3)  # half as wide
-        1.452
-    """
-    if action_std is None:
-        return "auto"
-    half_range = (action_spec.space.high - action_spec.space.low) / 2
-    return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())
-
-
 def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
     """Room for ``size`` transitions, taken when the first one comes; in files with ``scratch``."""
     if scratch is None:
         return LazyTensorStorage(size, device=device)
     # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
     return LazyMemmapStorage(size, scratch_dir=scratch, existsok=True)
-
-
-def ready_for_training(sac: SACLoss, *, gamma: float, tau: float) -> SoftUpdate:
-    """Give a SAC loss its discount factor and its target updater."""
-    sac.make_value_estimator(gamma=gamma)
-    _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
-    return FusedSoftUpdate(sac, tau=tau)
-
-
-def make_optimizer(device: torch.device, *groups: tuple[Iterable[Tensor], float]) -> Adam:
-    """Adam for several groups of parameters, each with its learning rate.
-
-    All groups take their step in one operation, which a CUDA graph can hold; it reads learning
-    rates from tensors there, so that they can change.
-    """
-    graphed = device.type == "cuda"
-    return Adam(
-        [
-            {"params": list(of), "lr": torch.tensor(lr, device=device) if graphed else lr}
-            for of, lr in groups
-        ],
-        fused=True,
-        capturable=graphed,
-    )
-
-
-def gradient_step(optimizer: Optimizer, loss: Tensor) -> None:
-    """One optimizer step on what this loss reaches."""
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    optimizer.step()

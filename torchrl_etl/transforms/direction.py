@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_etl.modules.checks import check_positive
+from torchrl_etl.checks import check_positive
 
 __all__ = ["DirectionPrimer"]
 

@@ -1,0 +1,95 @@
+"""What stage 1 found: numbers, warnings in words, and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_etl.analysis.diagnostics import (
+    control_authority,
+    mixture_usage,
+    nmf_vaf,
+    pca_vaf,
+    synergy_warnings,
+    variance_accounted_for,
+)
+from torchrl_etl.analysis.pictures import synergy_heatmap, vaf_curve
+from torchrl_etl.modules import SynergyMap
+from torchrl_etl.synergies import GMVAESynergies, SynergyModel
+
+__all__ = ["describe_synergies", "draw_synergies"]
+
+
+@torch.no_grad()
+def describe_synergies(
+    model: SynergyModel, decoder: SynergyMap, actions: Tensor
+) -> tuple[dict[str, Any], list[str]]:
+    """Numbers of a synergy space on the actions [N, n] it was fitted to, and its warnings.
+
+    Returns:
+        dict: ``vaf``, ``pca_vaf`` and ``nmf_vaf`` at the same d, ``control_authority`` (mean share
+        of an actuator's range that the decoder commands) and, of a mixture,
+        ``effective_components``.
+        list of str: what is wrong with it, in words.
+    """
+    authority = control_authority(decoder)
+    vaf = variance_accounted_for(actions, model.reconstruct(actions))
+    pca = pca_vaf(actions, model.num_synergies)
+    numbers: dict[str, Any] = {
+        "vaf": vaf,
+        "pca_vaf": pca,
+        "nmf_vaf": nmf_vaf(actions, model.num_synergies, low=decoder.low),
+        "control_authority": authority.mean().item(),
+    }
+    usage = None
+    if isinstance(model, GMVAESynergies):
+        usage = mixture_usage(model.model, actions)
+        numbers["effective_components"] = usage.effective
+    return numbers, synergy_warnings(vaf=vaf, pca_vaf=pca, authority=authority, usage=usage)
+
+
+def draw_synergies(
+    make_model: Callable[[int], SynergyModel],
+    decoder: SynergyMap,
+    actions: Tensor,
+    names: Sequence[str],
+    folder: Path,
+    *,
+    dims: Sequence[int],
+    on_update: Callable[[], None] = lambda: None,
+) -> None:
+    """Heat map over named muscles, and VAF against d beside PCA and NMF.
+
+    Args:
+        make_model (callable): a fresh synergy model with so many synergies.
+        decoder (SynergyMap): the decoder that was found.
+        actions (Tensor): what it was fitted to [N, n].
+        names (sequence of str): actuators, in action order.
+        folder (path): where the PNGs go.
+
+    Keyword Args:
+        dims (sequence of int): numbers of synergies on the VAF curve; those above n are left out.
+            A fresh model is fitted at every d, so that the curve compares dimensions and not
+            training times.
+        on_update (callable): called before every update; may raise to stop.
+    """
+    synergy_heatmap(decoder, names, folder / "synergies.png")
+    dims = sorted({d for d in (*dims, decoder.num_synergies) if d <= decoder.action_dim})
+    kind = make_model(1).kind.upper()
+    series: dict[str, list[float]] = {kind: [], "PCA": [], "NMF": []}
+    with torch.random.fork_rng():
+        for d in dims:
+            model = make_model(d)
+            model.fit(actions, on_update=on_update)
+            with torch.no_grad():
+                vaf = variance_accounted_for(actions, model.reconstruct(actions))
+            series[kind].append(vaf)
+            if kind != "PCA":
+                series["PCA"].append(pca_vaf(actions, d))
+            if kind != "NMF":
+                series["NMF"].append(nmf_vaf(actions, d, low=decoder.low))
+    vaf_curve(dims, series, folder / "vaf.png", chosen_d=decoder.num_synergies)

@@ -1,0 +1,104 @@
+"""Checks of arguments: what came, what is expected, and where one can see it, how to mend it.
+
+Every message begins with the argument's name, so that whoever builds a thing from a section of a
+configuration can put the section's name before it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+
+__all__ = ["check_choice", "check_flag", "check_integer", "check_positive", "check_real"]
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Raise a ``ValueError`` that lists the choices and names the nearest.
+
+    Examples:
+        >>> check_choice("stage", "learn", ("explore", "learn", "all"))
+        >>> check_choice("stage", "lern", ("explore", "learn", "all"))
+        Traceback (most recent call last):
+        ...
+        ValueError: stage is 'lern'; choose one of explore, learn, all (nearest: learn).
+    """
+    if value not in choices:
+        near = difflib.get_close_matches(str(value), choices, n=1)
+        hint = f" (nearest: {near[0]})" if near else ""
+        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
+
+
+def check_positive(**sizes: object) -> None:
+    """Raise a ``ValueError`` naming the first size that is not a positive integer.
+
+    Examples:
+        >>> check_positive(latent_dim=4)
+        >>> check_positive(latent_dim=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: latent_dim is 0; it must be a positive integer.
+    """
+    for name, size in sizes.items():
+        if not _is_integer(size) or size < 1:
+            raise ValueError(f"{name} is {size!r}; it must be a positive integer.")
+
+
+def check_integer(least: int, **values: object) -> None:
+    """Raise a ``ValueError`` naming the first value that is not an integer of ``least`` or more.
+
+    Examples:
+        >>> check_integer(2, batch_size=1)
+        Traceback (most recent call last):
+        ...
+        ValueError: batch_size is 1; it must be a whole number, 2 or more.
+    """
+    for name, value in values.items():
+        if not _is_integer(value) or value < least:
+            raise ValueError(f"{name} is {value!r}; it must be a whole number, {least} or more.")
+
+
+def check_real(interval: str, **values: object) -> None:
+    """Raise a ``ValueError`` naming the first value that is not a number in the interval.
+
+    Examples:
+        >>> check_real("[0, 1)", gamma=0.9, tau=0)
+        >>> check_real("[0, 1)", gamma=1.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: gamma is 1.0; it must be a number in [0, 1).
+        >>> check_real("(0, inf)", lr=float("nan"))
+        Traceback (most recent call last):
+        ...
+        ValueError: lr is nan; it must be a number above 0.
+    """
+    low, high = map(float, interval[1:-1].split(","))
+    for name, value in values.items():
+        within = (
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and math.isfinite(value)
+            and (low <= value if interval[0] == "[" else low < value)
+            and (value <= high if interval[-1] == "]" else value < high)
+        )
+        if not within:
+            words = {"(0, inf)": "above 0", "[0, inf)": "0 or more"}.get(interval, f"in {interval}")
+            raise ValueError(f"{name} is {value!r}; it must be a number {words}.")
+
+
+def check_flag(**values: object) -> None:
+    """Raise a ``ValueError`` naming the first value that is neither true nor false.
+
+    Examples:
+        >>> check_flag(unit_rows="no")
+        Traceback (most recent call last):
+        ...
+        ValueError: unit_rows is 'no'; it must be true or false.
+    """
+    for name, value in values.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is {value!r}; it must be true or false.")
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

@@ -1,0 +1,156 @@
+"""A whole run: what its method does first, then learning the task, then a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from torchrl.checkpoint import Checkpoint
+
+from torchrl_etl.checks import check_choice
+from torchrl_etl.envs import episode_length, resolve_task
+from torchrl_etl.methods import METHODS
+from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.config import validate
+from torchrl_etl.training.context import Context
+from torchrl_etl.training.evaluation import Evaluation, evaluate
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.run_folder import RunFolder, facts
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["Experiment"]
+
+
+class Experiment:
+    """One run from a resolved configuration.
+
+    Args:
+        config (DictConfig): see ``recipes/conf/config.yaml``.
+
+    Keyword Args:
+        resume (path, optional): the run folder to go on in.
+        say (callable): where messages for a person go, one line each. Default: nowhere.
+
+    Raises:
+        ValueError: if the configuration is not one that can run.
+    """
+
+    def __init__(
+        self,
+        config: DictConfig,
+        *,
+        resume: Path | None = None,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        validate(config)
+        check_choice("method.learner", config.method.learner, list(METHODS))
+        self.config = config.copy()
+        self.task = resolve_task(config.env, config.goal)
+        self.folder = RunFolder(resume or Path(config.run_dir), self.config)
+        self.context = Context(self.config, self.folder, say)
+        self.method = METHODS[config.method.learner](self.context)
+        if config.frames is not None:
+            self._divide_frames()
+        self.method.check()
+        self.resume = resume is not None
+
+    def run(self) -> dict[str, Any]:
+        """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
+        self.folder.open(resume=self.resume)
+        if self.config.threads:
+            torch.set_num_threads(self.config.threads)
+        summary: dict[str, Any] = {
+            "env": self.config.env,
+            "goal": self.task.goal,
+            "seed": self.config.seed,
+        }
+        with StopOnSignal() as stop, closing(self.folder):
+            summary |= self.method.prepare(stop)
+            if self.config.stage != "explore":
+                summary["learn"] = self._learn(stop)
+            self.folder.write_json("summary.json", {**summary, "versions": facts()})
+        return summary
+
+    def learned(self) -> Stage:
+        """The stage that learns the task, its policy that of the newest whole checkpoint.
+
+        Raises:
+            FileNotFoundError: if the run has no such checkpoint.
+        """
+        stage = self.method.stage()
+        folder = Checkpoints(self.folder.checkpoints(stage.name), keep_last=2).newest_whole()
+        if folder is None:
+            raise FileNotFoundError(
+                f"{self.folder.path} holds no whole checkpoint of stage 2; evaluate a run that has "
+                "begun to learn."
+            )
+        Checkpoint(policy=stage.learner.policy).load(folder)
+        return stage
+
+    def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
+        """Evaluates the stage's present policy on the evaluation seeds."""
+        return partial(
+            evaluate,
+            stage.learner.policy,
+            self.context.make_env(),
+            episodes=self.config.evaluation.episodes,
+            max_steps=episode_length(self.config.env, self.config.goal) or 1000,
+            action_repeat=self.config.action_repeat,
+        )
+
+    def _learn(self, stop: StopOnSignal) -> dict[str, Any]:
+        stage, charged = self.method.stage(), self.method.charged
+        self.method.begin(stage)
+        evaluator = self.evaluator(stage)
+        last = self.context.run_stage(
+            stage,
+            stop,
+            evaluate=evaluator,
+            evaluate_every=self.config.evaluation.every,
+            offset=charged,
+        )
+        after = last or evaluator()
+        if self.config.pictures:
+            self._draw_curves(charged)
+        summary: dict[str, Any] = {"frames": stage.frames, "frames_charged": charged + stage.frames}
+        for key, value in after.intervals().items():
+            before = self.folder.series(f"learn/eval/{key}")[1]
+            summary[key] = {
+                "before": before[0] if before else math.nan,
+                "after": value.mean,
+                "low": value.low,
+                "high": value.high,
+            }
+        return summary
+
+    def _draw_curves(self, charged: int) -> None:
+        from torchrl_etl.analysis import learning_curves
+
+        frames, returns = self.folder.series("learn/eval/return")
+        solved = dict(zip(*self.folder.series("learn/eval/solved"), strict=True))
+        rows = [
+            {"frames": frame, "return": value, "solved": solved.get(frame)}
+            for frame, value in zip(frames, returns, strict=True)
+        ]
+        learning_curves(
+            rows,
+            self.folder.pictures / "learning_curves.png",
+            explore_frames=charged or None,
+            title=f"{self.config.env} ({self.task.goal} goal)",
+        )
+
+    def _divide_frames(self) -> None:
+        """Leave to learning what does not go into what comes before it."""
+        left = self.config.frames - self.method.charged
+        if left < 1:
+            raise ValueError(
+                f"frames is {self.config.frames}, of which {self.method.charged} go into what "
+                "comes before learning; give more in all, or less to that."
+            )
+        self.config.learn.frames = left

@@ -1,0 +1,78 @@
+"""Exploration along directions of a state embedding (Eq. 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+
+from torchrl_etl.exploration.exploration import Exploration
+from torchrl_etl.modules import StateEncoder
+from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, RedrawDirection
+
+__all__ = ["DirectionExploration"]
+
+
+class DirectionExploration(Exploration):
+    """Each episode follows a direction z; moving the embedding φ along it is rewarded.
+
+    Subclasses train φ. Sampled batches are relabelled with other directions, which Eq. 1 allows:
+    it rewards any step along any direction.
+
+    Equation: 1, r^b = ⟨φ(s') - φ(s), z⟩.
+
+    Args:
+        observation_dim (int): size of an observation.
+
+    Keyword Args:
+        encoder, direction, bonus (mapping): keyword arguments of
+            :class:`~torchrl_etl.modules.StateEncoder`,
+            :class:`~torchrl_etl.transforms.DirectionPrimer` and
+            :class:`~torchrl_etl.transforms.IntrinsicReward`.
+        relabel (float): share of each batch that is relabelled with a direction drawn anew, see
+            :class:`~torchrl_etl.transforms.RedrawDirection`.
+        device (torch.device): of φ. Default: the CPU.
+    """
+
+    reward = "intrinsic_reward"
+    keep = ("direction", ("next", "direction"))
+
+    def __init__(
+        self,
+        observation_dim: int,
+        *,
+        encoder: Mapping[str, Any],
+        direction: Mapping[str, Any],
+        bonus: Mapping[str, Any],
+        relabel: float = 1.0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__()
+        self.encoder = StateEncoder(observation_dim, **encoder).to(device)
+        self.inputs = {"direction": self.encoder.embedding_dim}
+        self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)
+        self._batch_transforms = (
+            RedrawDirection(self.primer.clone(), share=relabel),
+            IntrinsicReward(self.encoder, **bonus),
+        )
+
+    def reset_transforms(self) -> Sequence[Transform]:
+        return (self.primer,)
+
+    def batch_transforms(self) -> Sequence[Transform]:
+        return self._batch_transforms
+
+    def describe(self, rows: TensorDictBase) -> dict[str, Any]:
+        """``direction_alignment``: how far the states reached lie along the directions followed."""
+        from torchrl_etl.analysis import direction_alignment
+
+        return {"direction_alignment": direction_alignment(*self.embed(rows["next"]))}
+
+    @torch.no_grad()
+    def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
+        device = next(self.encoder.parameters()).device
+        return self.encoder(rows["observation"].to(device)), rows["direction"]

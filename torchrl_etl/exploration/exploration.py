@@ -1,0 +1,63 @@
+"""What stage 1 needs to know of a way to explore."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs.transforms import Transform
+
+from torchrl_etl.learners.term import Term
+
+__all__ = ["Exploration"]
+
+
+class Exploration:
+    """A way to explore: what is drawn at reset, what a sampled batch gets, what is trained.
+
+    This one is SAC on the task's reward, without anything added. Others override what differs, in
+    a file of their own, and put themselves into
+    :data:`~torchrl_etl.exploration.EXPLORATIONS` (see ``docs/extend.md``).
+
+    Attributes:
+        reward (NestedKey): what SAC learns on in stage 1, below ``"next"``.
+        keep (sequence of NestedKey): entries of a transition that the buffer must keep for it.
+        inputs (mapping): sizes of what actor and critics read beside the observation, by key.
+        learns (bool): whether a policy is trained at all.
+    """
+
+    reward: NestedKey = "reward"
+    keep: Sequence[NestedKey] = ()
+    inputs: Mapping[str, int]
+    learns: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self.inputs = {}
+
+    def reset_transforms(self) -> Sequence[Transform]:
+        """For the environment: they draw what holds for an episode. Each simulator gets clones."""
+        return ()
+
+    def batch_transforms(self) -> Sequence[Transform]:
+        """For the buffer: they see each sampled batch, with all networks as they are by then."""
+        return ()
+
+    def terms(self) -> Sequence[Term]:
+        """Losses that train a representation beside the policy."""
+        return ()
+
+    def behavior(self, actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
+        """The policy that collects."""
+        return actor
+
+    def describe(self, rows: TensorDictBase) -> dict[str, Any]:
+        """Facts about what was explored, for the bundle; ``rows`` are the latest transitions."""
+        return {}
+
+    def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor] | None:
+        """Embeddings [*, k] and directions [*, k] of transitions, for a picture, if it has them."""
+        return None

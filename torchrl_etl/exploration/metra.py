@@ -1,0 +1,37 @@
+"""Exploration under METRA's constraint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torchrl_etl.exploration.directions import DirectionExploration
+from torchrl_etl.learners.term import Term
+from torchrl_etl.objectives import METRALoss
+
+__all__ = ["METRAExploration"]
+
+
+class METRAExploration(DirectionExploration):
+    """φ maximizes the bonus itself while its steps stay within length one (Park 2024).
+
+    Equation: see :class:`~torchrl_etl.objectives.METRALoss`.
+
+    Args:
+        observation_dim (int): size of an observation.
+
+    Keyword Args:
+        lr (float): learning rate of φ and of the multiplier.
+        metra (mapping): keyword arguments of the loss.
+        **directions: see :class:`~torchrl_etl.exploration.DirectionExploration`.
+    """
+
+    def __init__(
+        self, observation_dim: int, *, lr: float, metra: Mapping[str, Any], **directions: Any
+    ) -> None:
+        super().__init__(observation_dim, **directions)
+        self._lr, self._metra = lr, dict(metra)
+
+    def terms(self) -> Sequence[Term]:
+        device = next(self.encoder.parameters()).device
+        return (Term(METRALoss(self.encoder, **self._metra).to(device), lr=self._lr),)

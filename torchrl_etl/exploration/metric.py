@@ -1,0 +1,44 @@
+"""Exploration in a behavioral-metric space: the paper's (Eqs. 1 to 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torchrl_etl.exploration.directions import DirectionExploration
+from torchrl_etl.learners.term import Term
+from torchrl_etl.modules import GaussianDynamics
+from torchrl_etl.objectives import BehavioralMetricLoss
+
+__all__ = ["MetricExploration"]
+
+
+class MetricExploration(DirectionExploration):
+    """φ learns distances that tell states apart by the task's reward and where they lead.
+
+    Equation: 2, 3, 5 and 6, see :class:`~torchrl_etl.objectives.BehavioralMetricLoss`.
+
+    Args:
+        observation_dim (int): size of an observation.
+
+    Keyword Args:
+        lr (float): learning rate of φ.
+        tau (float): EMA rate of the target encoder.
+        metric (mapping): keyword arguments of the loss.
+        **directions: see :class:`~torchrl_etl.exploration.DirectionExploration`.
+    """
+
+    def __init__(
+        self, observation_dim: int, *, lr: float, tau: float, metric: dict[str, Any], **directions: Any
+    ) -> None:
+        super().__init__(observation_dim, **directions)
+        self._lr, self._tau, self._metric = lr, tau, dict(metric)
+
+    def terms(self) -> Sequence[Term]:
+        dynamics = None
+        if self._metric.get("divergence") == "gaussian":
+            dynamics = GaussianDynamics(self.encoder.embedding_dim)
+        device = next(self.encoder.parameters()).device
+        loss = BehavioralMetricLoss(self.encoder, dynamics, **self._metric).to(device)
+        tau = self._tau if self._metric.get("delay_encoder", True) else None
+        return (Term(loss, lr=self._lr, tau=tau),)

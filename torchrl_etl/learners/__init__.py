@@ -1,0 +1,8 @@
+"""What learns: networks, losses, targets and optimizer behind one ``update``."""
+
+from torchrl_etl.learners.build import build_learner
+from torchrl_etl.learners.objective import NORMALIZED, Objective
+from torchrl_etl.learners.sac import SACLearner, entropy_target
+from torchrl_etl.learners.term import Term
+
+__all__ = ["NORMALIZED", "Objective", "SACLearner", "Term", "build_learner", "entropy_target"]

@@ -1,0 +1,91 @@
+"""A learner out of the sections of a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torchrl.data import Bounded
+
+from torchrl_etl.checks import check_choice, check_flag
+from torchrl_etl.learners.objective import NORMALIZED
+from torchrl_etl.learners.sac import SACLearner, entropy_target
+from torchrl_etl.modules import HeldNoise, RunningNorm, SynergyMap, make_actor, make_critic
+
+__all__ = ["Noise", "build_learner"]
+
+Noise = Literal["independent", "held"]
+Actor = ProbabilisticTensorDictSequential
+
+
+def build_learner(
+    observation_dim: int,
+    action_spec: Bounded,
+    *,
+    actor: Mapping[str, Any],
+    critic: Mapping[str, Any],
+    sac: Mapping[str, Any],
+    noise: Mapping[str, Any],
+    decoder: SynergyMap | None = None,
+    inputs: Mapping[str, int] | None = None,
+    make_actor: Callable[..., Actor] = make_actor,
+    make_behavior: Callable[[Actor], TensorDictModuleBase] | None = None,
+    entropy: Callable[[Bounded, float | None], float | Literal["auto"]] = entropy_target,
+    more: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
+) -> SACLearner:
+    """Build the networks for an environment's sizes and a learner that owns them.
+
+    Args:
+        observation_dim (int): size of an observation.
+        action_spec (Bounded): bounds of the environment's action, unbatched, on the device that
+            everything shall live on.
+
+    Keyword Args:
+        actor, critic (mapping): keyword arguments of ``make_actor`` and
+            :func:`~torchrl_etl.modules.make_critic`.
+        sac (mapping): keyword arguments of :class:`~torchrl_etl.learners.SACLearner`, and
+            ``action_std`` (see :func:`~torchrl_etl.learners.entropy_target`) and
+            ``normalize_observations`` (actor and critics see what
+            :class:`~torchrl_etl.modules.RunningNorm` makes of observations).
+        noise (mapping): of exploration: ``kind``, ``"independent"`` at every step or ``"held"``
+            for several, and keyword arguments of :class:`~torchrl_etl.modules.HeldNoise`.
+        decoder (SynergyMap, optional): the actor emits what it reads. Default: an action.
+        inputs (mapping, optional): sizes of what the networks read beside the observation, by key.
+        make_actor (callable): builds the actor. Default: :func:`~torchrl_etl.modules.make_actor`.
+        make_behavior (callable, optional): makes the policy that collects of the actor; ``noise``
+            is then not read.
+        entropy (callable): target entropy of the bounds and ``action_std``.
+        more (callable): further arguments of the learner, made for the actor.
+
+    Raises:
+        ValueError: naming the argument that cannot be used.
+    """
+    sac, noise, device = dict(sac), dict(noise), action_spec.device
+    check_choice("noise.kind", kind := noise.pop("kind"), get_args(Noise))
+    check_flag(**{"sac.normalize_observations": (norm := sac.pop("normalize_observations"))})
+    normalizer = RunningNorm(observation_dim).to(device) if norm else None
+    inputs = {NORMALIZED if norm else "observation": observation_dim, **(inputs or {})}
+    if decoder is None:
+        emitted, out_key = action_spec, "action"
+    else:
+        emitted, out_key = decoder.to(device).synergy_spec, decoder.in_keys[0]
+    policy = make_actor(inputs, emitted, out_key=out_key, **actor).to(device)
+    value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
+    if make_behavior is None:
+        behavior = HeldNoise(policy, **noise) if kind == "held" else policy
+    else:
+        behavior = make_behavior(policy)
+    return SACLearner(
+        policy,
+        value,
+        action_spec=emitted,
+        decoder=decoder,
+        behavior=behavior,
+        normalizer=normalizer,
+        target_entropy=entropy(emitted, sac.pop("action_std")),
+        bins=critic.get("bins", 1),
+        **sac,
+        **more(policy),
+    )

@@ -1,0 +1,295 @@
+"""Soft actor-critic: everything that one update touches, and the update."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.optim import Adam
+from torch.optim.swa_utils import AveragedModel
+from torchrl.data import Bounded
+
+from torchrl_etl.learners.compiled import compiled, cuda_graph
+from torchrl_etl.learners.ema import warmed_up_ema
+from torchrl_etl.learners.objective import NORMALIZED, Objective
+from torchrl_etl.learners.term import Term
+from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap, normalize_rows
+from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss, SynergySACLoss
+
+__all__ = ["SACLearner", "entropy_target"]
+
+
+class SACLearner:
+    """Soft actor-critic that owns its networks, targets, statistics and optimizer.
+
+    Both stages of ETL and all its rivals are this class with other objects handed to it.
+
+    Args:
+        actor (ProbabilisticTensorDictSequential): emits an action, or with a decoder synergies.
+        critic (TensorDictModule): values an action; it is copied ``num_critics`` times.
+
+    Keyword Args:
+        action_spec (Bounded): what the actor emits, unbatched.
+        decoder (SynergyMap, optional): turns what the actor emits into actions.
+        train_decoder (bool): let the actor loss reach the decoder. Default: ``False``.
+        behavior (TensorDictModuleBase, optional): the actor with its exploration noise, which
+            collects. Default: the actor.
+        terms (sequence of Term): further losses. Default: none.
+        normalizer (RunningNorm, optional): the networks read
+            :data:`~torchrl_etl.learners.NORMALIZED`, which it makes of ``observation``.
+        reward (NestedKey): what SAC learns on. Default: ``"reward"``.
+        gamma (float): discount factor. Default: 0.99.
+        tau (float): EMA rate of the target critics. Default: 0.005.
+        lr, lr_end (float): learning rate, and the share of all learning rates that is left at the
+            last frame; they fall linearly. Default: 3e-4 and 1.
+        ema_decay (float): decay of the EMA of the actor that is evaluated and saved. Default: 0.
+        alpha_init (float): initial temperature. Default: 1.
+        target_entropy (float or "auto"): see :func:`entropy_target`. Default: ``"auto"``.
+        num_critics (int): the smallest of whose values counts. Default: 2.
+        loss_function (str): error of scalar critics. Default: ``"l2"``.
+        return_bound (float, optional): rewards are scaled so that returns stay within it.
+        bins (int): above 1, critics are categorical with so many returns in ±``return_bound``.
+        unit_rows (bool): rows of all linear layers keep unit length. Default: ``False``.
+        on_frames, on_restart (callable, optional): told the number of frames, after each batch and
+            where new episodes begin.
+        compile (bool): compile updates; on CUDA they also become one CUDA graph.
+
+    Raises:
+        ValueError: for categorical critics without a bound on returns.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_etl.learners import SACLearner
+        >>> from torchrl_etl.modules import make_actor, make_critic
+        >>> spec = Bounded(-1, 1, shape=(2,))
+        >>> actor = make_actor({"observation": 3}, spec)
+        >>> critic = make_critic({"observation": 3, "action": 2})
+        >>> learner = SACLearner(actor, critic, action_spec=spec)
+        >>> [entry for entry in learner.policy.in_keys]
+        ['observation']
+    """
+
+    def __init__(
+        self,
+        actor: ProbabilisticTensorDictSequential,
+        critic: TensorDictModule,
+        *,
+        action_spec: Bounded,
+        decoder: SynergyMap | None = None,
+        train_decoder: bool = False,
+        behavior: TensorDictModuleBase | None = None,
+        terms: Sequence[Term] = (),
+        normalizer: RunningNorm | None = None,
+        reward: NestedKey = "reward",
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        lr: float = 3e-4,
+        lr_end: float = 1.0,
+        ema_decay: float = 0.0,
+        alpha_init: float = 1.0,
+        target_entropy: float | Literal["auto"] = "auto",
+        num_critics: int = 2,
+        loss_function: str = "l2",
+        return_bound: float | None = None,
+        bins: int = 1,
+        unit_rows: bool = False,
+        on_frames: Callable[[int], None] | None = None,
+        on_restart: Callable[[int], None] | None = None,
+        compile: bool = False,
+    ) -> None:
+        self.gamma, self.lr_end, self.device = gamma, lr_end, next(actor.parameters()).device
+        self.on_frames, self.on_restart = on_frames, on_restart
+        options: dict[str, Any] = {
+            "action_spec": action_spec,
+            "target_entropy": target_entropy,
+            "alpha_init": alpha_init,
+            "num_qvalue_nets": num_critics,
+            "loss_function": loss_function,
+            "support": support(bins, return_bound),
+        }
+        if decoder is None:
+            sac = LeanSACLoss(actor, critic, **options)
+        else:
+            sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
+        self.objective = Objective(
+            sac,
+            terms,
+            normalizer=normalizer,
+            return_scale=None if return_bound is None else ReturnScale(gamma, bound=return_bound),
+            reward=reward,
+        ).to(self.device)
+        sac.make_value_estimator(gamma=gamma)
+        _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
+        self.targets = [FusedSoftUpdate(sac, tau=tau)]
+        self.targets += [term.target for term in terms if term.target is not None]
+        self.ema = AveragedModel(actor, multi_avg_fn=warmed_up_ema(ema_decay))
+        self.behavior = self._from_observation(actor if behavior is None else behavior, decoder)
+        self.policy = self._from_observation(self.ema.module, decoder)
+        self.actor, self.decoder = actor, decoder
+        self.unit_rows = list(linear_weights(sac)) if unit_rows else []
+        normalize_rows(self.unit_rows)
+        self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
+        self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self._gradients = compiled(self.gradients) if compile else self.gradients
+        graphed = compile and self.device.type == "cuda"
+        self._step = cuda_graph(self.step) if graphed else self.step
+
+    def update(self, batch: TensorDictBase) -> TensorDictBase:
+        """Learn from a batch of transitions [B]; returns scalars to log."""
+        scalars = self._step(batch)
+        self.ema.update_parameters(self.actor)  # counts in Python: no part of a CUDA graph
+        return scalars
+
+    def step(self, batch: TensorDictBase) -> TensorDictBase:
+        """Critics, actor, temperature and terms take a gradient step; their targets follow."""
+        gradients, scalars = self._gradients(batch)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.optimizer.step()
+        normalize_rows(self.unit_rows)
+        for target in self.targets:
+            target.step()
+        return scalars
+
+    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+        """Gradients of the objective, in the order of ``parameters``, and scalars to log."""
+        loss, scalars = self.objective(batch)
+        return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
+
+    def update_term(self, term: Term, batch: TensorDictBase) -> None:
+        """One gradient step on a single term, by the same optimizer."""
+        gradients = torch.autograd.grad(term(batch)[0], self.parameters, allow_unused=True)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.optimizer.step()
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Take a batch [simulators, time] as it was collected into the running statistics."""
+        if self.objective.return_scale is not None:
+            reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
+            self.objective.return_scale.update(reward, done, episode_numbers(batch))
+        if self.objective.normalizer is not None:
+            self.objective.normalizer.see(batch["observation"])
+
+    def restart(self, frames: int) -> None:
+        """All episodes begin anew after so many frames."""
+        if self.objective.return_scale is not None:
+            self.objective.return_scale.forget()
+        if self.on_restart is not None:
+            self.on_restart(frames)
+
+    def advance(self, frames: int, progress: float) -> None:
+        """Set what depends on the number of frames, and on the share of all frames that it is."""
+        factor = 1.0 - (1.0 - self.lr_end) * min(1.0, progress)
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            if isinstance(group["lr"], Tensor):  # read by a CUDA graph
+                group["lr"].fill_(factor * rate)
+            else:
+                group["lr"] = factor * rate
+        if self.on_frames is not None:
+            self.on_frames(frames)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint holds; ``policy`` alone is what a trained learner acts by."""
+        return {
+            "policy": self.policy,
+            "objective": self.objective,
+            "ema": self.ema,
+            "optimizer": self.optimizer,
+        }
+
+    def _from_observation(
+        self, actor: TensorDictModuleBase, decoder: SynergyMap | None
+    ) -> TensorDictModuleBase:
+        """The actor as it acts in an environment: on raw observations, with decoded actions."""
+        before, after = [], [] if decoder is None else [decoder]
+        if self.objective.normalizer is not None:
+            before = [TensorDictModule(self.objective.normalizer, ["observation"], [NORMALIZED])]
+        return TensorDictSequential(*before, actor, *after) if before or after else actor
+
+
+def entropy_target(action_spec: Bounded, action_std: float | None) -> float | Literal["auto"]:
+    """Entropy of a Gaussian with ``action_std`` per dimension, in units where the bounds are ±1.
+
+    ``None`` gives SAC's usual minus the number of dimensions ("auto").
+
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> round(entropy_target(Bounded(-1, 1, shape=(2,)), action_std=1.0), 3)  # ln(2πe)
+        2.838
+        >>> round(entropy_target(Bounded(0, 1, shape=(2,)), action_std=1.0), 3)  # half as wide
+        1.452
+    """
+    if action_std is None:
+        return "auto"
+    half_range = (action_spec.space.high - action_spec.space.low) / 2
+    return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())
+
+
+def support(bins: int, bound: float | None) -> Tensor | None:
+    """Where categorical critics put the return; ``None`` for critics of one output.
+
+    Examples:
+        >>> support(3, 5.0)
+        tensor([-5.,  0.,  5.])
+    """
+    if bins == 1:
+        return None
+    if bound is None:
+        raise ValueError(
+            f"return_bound is null but critics have {bins} bins; categorical critics need a bound "
+            "on returns, such as return_bound=5."
+        )
+    return torch.linspace(-bound, bound, bins)
+
+
+def episode_numbers(batch: TensorDictBase) -> Tensor:
+    """A number for the episode of each transition [*].
+
+    Workers of one machine number theirs together, those on other machines each on their own.
+    """
+    number = batch["collector", "traj_ids"]
+    worker = batch.get(("collector", "worker"), None)
+    return number if worker is None else number + (worker << 32)
+
+
+def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
+    """Weights of the linear layers of actor [out, in] and stacked critics [critics, out, in]."""
+    for params, ndim in ((sac.actor_network_params, 2), (sac.qvalue_network_params, 3)):
+        yield from (p for p in params.parameters() if p.ndim == ndim)
+
+
+def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
+    """What is trained, each parameter once: a term's own at its learning rate, then SAC's."""
+    groups, known = [], set()
+    for module, rate in (*((term.loss, term.lr or lr) for term in terms), (sac, lr)):
+        fresh = [p for p in module.parameters() if p.requires_grad and id(p) not in known]
+        known |= {id(parameter) for parameter in fresh}
+        if fresh:
+            groups.append({"params": fresh, "lr": rate})
+    return groups
+
+
+def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> Adam:
+    """Adam that takes all steps in one operation, which a CUDA graph can hold.
+
+    It reads learning rates from tensors there, so that they can change.
+    """
+    graphed = device.type == "cuda"
+    if graphed:
+        groups = [{**group, "lr": torch.tensor(group["lr"], device=device)} for group in groups]
+    return Adam(list(groups), fused=True, capturable=graphed)

@@ -1,0 +1,66 @@
+"""One more objective of a learner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_etl.objectives import FusedSoftUpdate
+
+__all__ = ["Term"]
+
+
+class Term(nn.Module):
+    """A loss that a learner minimizes beside SAC's, on the same batch and with the same optimizer.
+
+    Args:
+        loss (LossModule): writes entries named ``loss_*``, which are summed, and scalars to log.
+
+    Keyword Args:
+        weight (float): of the sum in what the learner minimizes; at 0 it is only logged.
+            Default: 1.
+        lr (float, optional): learning rate of the parameters that this loss holds. Default: that
+            of the learner.
+        tau (float, optional): how fast the loss's target networks follow, as an EMA.
+            Default: ``None``, there are none.
+        inputs (callable, optional): makes what the loss reads out of a batch. Default: the batch.
+
+    Raises:
+        ValueError: if the weight is negative.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_etl.learners import Term
+        >>> from torchrl_etl.modules import SynergyDecoder
+        >>> from torchrl_etl.objectives import DecoderLoss
+        >>> term = Term(DecoderLoss(SynergyDecoder(2, 6)), weight=0.1, lr=3e-5)
+        >>> batch = TensorDict({"synergy": torch.zeros(4, 2), "action": torch.zeros(4, 6)}, [4])
+        >>> loss, scalars = term(batch)
+        >>> bool(loss == 0.1 * scalars["loss_decoder"])
+        True
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        *,
+        weight: float = 1.0,
+        lr: float | None = None,
+        tau: float | None = None,
+        inputs: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> None:
+        if not weight >= 0.0:
+            raise ValueError(f"weight is {weight}; a loss is minimized, so it must be 0 or more.")
+        super().__init__()
+        self.loss, self.weight, self.lr, self.inputs = loss, weight, lr, inputs
+        self.target = None if tau is None else FusedSoftUpdate(loss, tau=tau)
+
+    def forward(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """What is minimized, weighted, and what is logged."""
+        out = self.loss(batch if self.inputs is None else self.inputs(batch))
+        losses = [value for key, value in out.items() if key.startswith("loss_")]
+        return self.weight * sum(losses), out

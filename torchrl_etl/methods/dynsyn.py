@@ -1,0 +1,83 @@
+"""DynSyn (He 2024): muscles that move alike share one action."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from torchrl.data import Bounded
+
+from torchrl_etl.baselines import (
+    group_muscles,
+    make_dynsyn_actor,
+    record_muscle_lengths,
+    set_frames,
+)
+from torchrl_etl.io import write_atomically
+from torchrl_etl.learners import entropy_target
+from torchrl_etl.methods.method import Method
+from torchrl_etl.training.context import Context
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["DynSyn"]
+
+
+class DynSyn(Method):
+    """SAC with one action a group; muscles are grouped while joints are thrown about.
+
+    Its actor's distribution is its own: ``learn.noise`` is not read.
+
+    Options: ``frames`` of the recording, which are charged, ``amplitude`` of joint velocities in
+    it, ``group_share``, groups per muscle, and keyword arguments of
+    :func:`~torchrl_etl.baselines.make_dynsyn_actor`.
+    """
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        options = dict(self.options)
+        self.charged = options.pop("frames")
+        self.amplitude, self.share = options.pop("amplitude"), options.pop("group_share")
+        self.actor_options = options
+        self.file = context.folder.path / "muscle_groups.json"
+
+    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+        if not self.file.is_file():
+            seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
+            lengths = record_muscle_lengths(
+                self.context.make_env(action_repeat=1),  # a recorded step is a frame
+                self.charged,
+                amplitude=self.amplitude,
+                seed=2**30 + seed,
+            )
+            groups = group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed)
+            write_atomically(self.file, json.dumps(groups.tolist()))
+        return {"groups": self.groups}
+
+    @property
+    def groups(self) -> list[int]:
+        if self.file.is_file():
+            return json.loads(self.file.read_text(encoding="utf-8"))
+        return list(range(len(self.context.spec.actuators)))  # a placeholder
+
+    def stage(self) -> Stage:
+        groups = self.groups
+
+        def make_actor(inputs, spec, **options):
+            return make_dynsyn_actor(inputs, spec, groups, **options, **self.actor_options)
+
+        def entropy(spec: Bounded, action_std: float | None) -> float:
+            # The actor's log-probability counts one dimension a group.
+            first = [groups.index(group) for group in sorted(set(groups))]
+            if action_std is None:
+                return -float(len(first))
+            return entropy_target(spec[first], action_std)
+
+        self.context.seed_everything("learn")
+        learner = self.context.learner(
+            make_actor=make_actor,
+            make_behavior=lambda actor: actor,
+            entropy=entropy,
+            more=lambda actor: {"on_frames": lambda frames: set_frames(actor, frames)},
+        )
+        return self.context.stage(learner)

@@ -1,0 +1,41 @@
+"""EME (Wang 2024): a bonus for steps that are long in a metric of reward and policy."""
+
+from __future__ import annotations
+
+from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
+from torchrl_etl.learners import Term
+from torchrl_etl.methods.method import Method
+from torchrl_etl.modules import StateEncoder
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["EME"]
+
+
+class EME(Method):
+    """SAC on reward plus bonus, the metric trained beside it.
+
+    Bonus and metric are of single steps: ``learn.n_steps`` is not read.
+
+    Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
+
+    Options: ``embedding_dim`` and ``hidden`` of the encoder, ``ensemble`` (its size), ``lr``,
+    ``tau`` (EMA rate of the target encoder), ``weight`` and ``max_scale`` of the bonus.
+    """
+
+    def stage(self) -> Stage:
+        spec, options = self.context.spec, self.options
+        sizes, device = (spec.observation_dim, spec.action_dim), spec.action_spec.device
+        self.context.seed_everything("learn")
+        encoder = StateEncoder(sizes[0], options["embedding_dim"], hidden=options["hidden"])
+        ensemble = RewardEnsemble(*sizes, options["ensemble"], hidden=options["hidden"])
+        encoder, ensemble = encoder.to(device), ensemble.to(device)
+
+        def more(actor):
+            loss = EMELoss(encoder, ensemble, actor).to(device)
+            term = Term(loss, lr=options["lr"], tau=options["tau"])
+            return {"terms": [term], "reward": "total_reward"}
+
+        bonus = EMEBonus(
+            encoder, ensemble, weight=options["weight"], max_scale=options["max_scale"]
+        )
+        return self.context.stage(self.context.learner(more=more), transforms=[bonus], n_steps=1)

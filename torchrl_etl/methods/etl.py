@@ -1,0 +1,294 @@
+"""Explore to Learn: synergies from exploration, then the task in synergies (Algorithm 1)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import safetensors.torch
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+
+from torchrl_etl.analysis import describe_synergies
+from torchrl_etl.checks import check_choice, check_real
+from torchrl_etl.envs import resolve_task
+from torchrl_etl.exploration import EXPLORATIONS, Exploration
+from torchrl_etl.io import surviving_folder, write_atomically
+from torchrl_etl.learners import Term
+from torchrl_etl.methods.method import Method
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
+from torchrl_etl.objectives import DecoderLoss
+from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
+from torchrl_etl.training.context import Context, naming
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["ETL", "Explorer", "FineTuning"]
+
+FineTuning = Literal["critic", "reconstruction", "frozen"]
+
+
+class Explorer:
+    """Stage 1: an exploration, a learner that is paid for it, and a synergy model beside it.
+
+    Every update draws one batch. Its bonus is computed as it is drawn, with the representation as
+    it then is; the policy, the representation and the synergy model learn from it side by side.
+
+    Deviates: after the last frame the synergy model is trained on for ``final_updates``; Algorithm
+    1 stops with the last frame (0).
+
+    Attributes:
+        exploration (Exploration): see there.
+        model (SynergyModel): see there.
+        stage (Stage): stage 1.
+    """
+
+    def __init__(self, context: Context) -> None:
+        fit = dict(context.options("explore")["fit"])
+        self.final_updates = fit.pop("final_updates")
+        context.seed_everything("explore")
+        self.exploration = make_exploration(context)
+        self.model = make_synergy_model(context)
+        for transform in (batch_transforms := self.exploration.batch_transforms()):
+            transform.to(context.device)
+
+        def more(actor):
+            with naming("fit"):
+                self.shown = ShownActions(actor, **fit)
+            terms = list(self.exploration.terms())
+            self.term = None
+            if self.model.loss is not None:
+                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)
+                terms.append(self.term)
+            return {"terms": terms, "reward": self.exploration.reward}
+
+        learner = context.learner(
+            "explore",
+            inputs=self.exploration.inputs,
+            make_behavior=self.exploration.behavior,
+            more=more,
+        )
+        env_options = {"activations": True} if fit["actions"] == "activation" else {}
+        self.stage = context.stage(
+            learner,
+            "explore",
+            env_options=env_options,
+            env_transforms=self.exploration.reset_transforms(),
+            transforms=batch_transforms,
+            keep=(*self.exploration.keep, *self.shown.keep),
+        )
+        self.seed = self.stage.seed
+
+
+    def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
+        """Train the synergy model to the end; returns the decoder for stage 2.
+
+        Keyword Args:
+            on_update (callable): called before every update; may raise to stop.
+        """
+        torch.manual_seed(self.seed)  # the same whether or not the run was resumed
+        if self.term is None:
+            self.model.fit(self.actions(), on_update=on_update)
+        for _ in range(self.final_updates if self.term is not None else 0):
+            on_update()
+            self.stage.learner.update_term(self.term, self.stage.buffer.sample())
+        return self.model.decoder(self.actions())
+
+    def actions(self, count: int = 20_000) -> torch.Tensor:
+        """Up to ``count`` of the latest actions that the synergy model is shown [N, n]."""
+        rows = self.stage.newest(count).to(self.stage.device)
+        for transform in self.stage.transforms[:1]:  # relabelled, as in a batch
+            rows = transform(rows)
+        return self.shown(rows)["action"]
+
+    def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
+        """All that was explored as stage 2 has it: the task's reward, and each executed action with
+        the coefficients that come nearest to it.
+        """
+        rows = self.stage.newest(self.stage.budget)
+        kept = rows.select("observation", "action", ("next", "observation"))
+        kept["next"].update(rows["next"].select("done", "terminated"))
+        kept["next", "reward"] = rows["next", "reward"] / self.stage.reward_scale
+        return kept.set("synergy", self.model.encode(decoder, rows["action"]))
+
+
+class ETL(Method):
+    """Algorithm 1: explore and condense, or take a bundle; then SAC on synergy coefficients.
+
+    The decoder is fine-tuned in one of three ways: ``"critic"`` (the actor loss runs through it,
+    Eq. 10 with ``distillation_weight`` keeps it from drifting), ``"reconstruction"`` (Eq. 10 alone,
+    as printed) or ``"frozen"``.
+
+    Deviates: see :class:`~torchrl_etl.objectives.SynergySACLoss`,
+    :class:`~torchrl_etl.objectives.DecoderLoss`, and ``docs/faithfulness.md``.
+    """
+
+    has_synergies = True
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        config = context.config
+        self.given = config.synergies.bundle is not None
+        self.charged = 0 if self.given else config.explore.frames
+        self.prefills = config.learn.prefill and not self.given
+        if config.stage == "learn" and not self.given:
+            raise ValueError(
+                "stage=learn needs synergies=PATH, the run folder or bundle of an earlier "
+                "exploration; use stage=all to explore first."
+            )
+        if config.stage == "explore" and self.given:
+            raise ValueError(
+                f"stage=explore finds synergies, but synergies={config.synergies.bundle} was given;"
+                " leave it out or use stage=learn."
+            )
+        if self.given:
+            _, info = load_bundle(config.synergies.bundle)
+            config.num_synergies = info.num_synergies
+            space = context.spec
+            check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
+        if config.num_synergies > context.spec.action_dim:
+            raise ValueError(
+                f"num_synergies is {config.num_synergies} but {config.env} has "
+                f"{context.spec.action_dim} actuators; choose at most that many."
+            )
+
+    def check(self) -> None:
+        if not self.given:
+            explorer = Explorer(self.context)
+            if explorer.shown.actions == "activation":
+                self.context.make_env(activations=True).close()
+        self.stage()
+
+    # Stage 1 -----------------------------------------------------------------------------------
+
+    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+        if not self.given and not surviving_folder(self.context.folder.synergies).exists():
+            self._explore(stop)
+        _, info = self.decoder()
+        return {"synergies": {"task": info.task, **info.facts}}
+
+    def _explore(self, stop: StopOnSignal) -> None:
+        """Explore and leave a bundle in the run folder; that it is there says that this is done."""
+        context, explorer = self.context, Explorer(self.context)
+        stage = explorer.stage
+        context.run_stage(stage, stop)
+        decoder = explorer.condense(stop.check)
+        numbers, warnings = describe_synergies(explorer.model, decoder, explorer.actions())
+        numbers |= {**explorer.exploration.describe(stage.newest(20_000)), "frames": stage.frames}
+        for warning in warnings:
+            context.say(f"Warning: {warning}")
+        if context.config.pictures:
+            self._draw(explorer, decoder, stop)
+        if self.prefills:
+            rows = explorer.transitions(decoder).flatten_keys(".").cpu()
+            tensors = {key: value.contiguous() for key, value in rows.items()}
+            write_atomically(context.folder.explored, safetensors.torch.save(tensors))
+        save_bundle(
+            decoder,
+            context.folder.synergies,
+            task=resolve_task(context.config.env, context.config.goal).env_id,
+            actuators=context.spec.actuators,
+            num_components=explorer.model.model.num_components,
+            facts={**numbers, "seed": context.config.seed, **facts()},
+        )
+
+    def _draw(self, explorer: Explorer, decoder: SynergyDecoder, stop: StopOnSignal) -> None:
+        from torchrl_etl.analysis import draw_synergies, embedding
+
+        context, curve = self.context, self.context.options("vaf_curve")
+        folder, updates = context.folder.pictures, curve.pop("updates")
+        try:
+            draw_synergies(
+                lambda d: make_synergy_model(context, d, updates=updates),
+                decoder,
+                explorer.actions(),
+                context.spec.actuators,
+                folder,
+                **curve,
+                on_update=stop.check,
+            )
+            if (embedded := explorer.exploration.embed(explorer.stage.newest(5000))) is not None:
+                embedding(*embedded, folder / "embedding.png")
+        except Exception as error:  # whatever a picture meets, the synergies are worth keeping
+            context.say(f"Warning: the pictures of the synergies could not be drawn ({error}).")
+
+    # Stage 2 -----------------------------------------------------------------------------------
+
+    def decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
+        """The decoder that was given or explored, and what is known of it."""
+        bundle = self.context.config.synergies.bundle or self.context.folder.synergies
+        return load_bundle(bundle, residual=self.context.config.learn.decoder.residual)
+
+    def stage(self) -> Stage:
+        if self.given or surviving_folder(self.context.folder.synergies).exists():
+            return self.learn_stage(self.decoder()[0])
+        return self.learn_stage(self._placeholder())
+
+    def learn_stage(self, decoder: SynergyDecoder) -> Stage:
+        """Stage 2 with this decoder, before its first frame."""
+        options = self.context.options("learn")["decoder"]
+        with naming("learn.decoder"):
+            check_choice("fine_tuning", mode := options["fine_tuning"], get_args(FineTuning))
+            check_real("[0, inf)", distillation_weight=options["distillation_weight"])
+            check_real("(0, inf)", lr=options["lr"])
+        weight = {"frozen": 0.0, "reconstruction": 1.0}.get(mode, options["distillation_weight"])
+        decoder = decoder.to(self.context.device).requires_grad_(mode != "frozen")
+        self.context.seed_everything("learn")
+        learner = self.context.learner(
+            decoder=decoder,
+            more=lambda actor: {
+                "train_decoder": mode == "critic",
+                "terms": [Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])],
+            },
+        )
+        room = self.context.config.explore.frames if self.prefills else 0
+        return self.context.stage(learner, keep=("synergy",), prefill_size=room)
+
+    def begin(self, stage: Stage) -> None:
+        if self.prefills:
+            stage.prefill(self._explored(stage.learner.decoder))
+
+    def _placeholder(self) -> SynergyDecoder:
+        """An untrained decoder of the sizes that the configuration asks for."""
+        spec, config = self.context.spec, self.context.config
+        return SynergyDecoder(
+            config.num_synergies,
+            spec.action_dim,
+            low=spec.low,
+            high=spec.high,
+            residual=config.learn.decoder.residual,
+        )
+
+    def _explored(self, decoder: SynergyDecoder) -> TensorDict:
+        """The transitions that stage 1 left; where there is a residual, theirs is zero."""
+        file = self.context.folder.explored
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file} is gone, and stage 2 begins with the transitions in it; start a new run, "
+                f"with synergies={self.context.folder.path} if it shall have the same synergies."
+            )
+        tensors = safetensors.torch.load(file.read_bytes())
+        rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
+        missing = decoder.synergy_dim - rows["synergy"].shape[-1]
+        rows["synergy"] = nn.functional.pad(rows["synergy"], (0, missing))
+        return rows.to(self.context.device)
+
+
+def make_exploration(context: Context) -> Exploration:
+    options = context.options("exploration")
+    check_choice("exploration.kind", kind := options.pop("kind"), list(EXPLORATIONS))
+    with naming("exploration"):
+        return EXPLORATIONS[kind](context.spec.observation_dim, device=context.device, **options)
+
+
+def make_synergy_model(
+    context: Context, num_synergies: int | None = None, **options: Any
+) -> SynergyModel:
+    options = {**context.options("synergies"), **options}
+    check_choice("synergies.kind", kind := options.pop("kind"), list(SYNERGY_MODELS))
+    options.pop("bundle")
+    number = context.config.num_synergies if num_synergies is None else num_synergies
+    with naming("synergies"):
+        return SYNERGY_MODELS[kind](context.spec.low, context.spec.high, number, **options)

@@ -1,0 +1,65 @@
+"""What every method is to a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from torchrl_etl.training.context import Context
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["Method"]
+
+
+class Method:
+    """What a run does before it learns the task, and with which learner it then does.
+
+    Args:
+        context (Context): configuration, folder and environment of the run.
+
+    Attributes:
+        charged (int): frames that :meth:`prepare` takes; they count.
+        has_synergies (bool): whether ``stage`` and ``synergies`` may be given.
+
+    Raises:
+        ValueError: for options that it does not have, or that cannot be used.
+    """
+
+    charged: int = 0
+    has_synergies: ClassVar[bool] = False
+    options: Mapping[str, Any]
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.options = context.options("method").get("options") or {}
+        config = context.config
+        if not self.has_synergies and (config.stage != "all" or config.synergies.bundle):
+            raise ValueError(
+                f"method={config.method.name} has one stage and no synergies; leave stage and "
+                "synergies out."
+            )
+
+    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+        """Find out what :meth:`stage` needs and leave it in the run folder.
+
+        What is there already is not done again.
+
+        Returns:
+            dict: facts for ``summary.json``.
+        """
+        return {}
+
+    def stage(self) -> Stage:
+        """The stage that learns the task, before its first frame.
+
+        Before :meth:`prepare` it has placeholders for what that finds.
+        """
+        raise NotImplementedError
+
+    def begin(self, stage: Stage) -> None:
+        """Give the stage what it has before its first frame; a checkpoint replaces it."""
+
+    def check(self) -> None:
+        """Build every part once, so that each objects to its arguments before the first frame."""
+        self.stage()

@@ -1,0 +1,110 @@
+"""Synergies of a Gaussian-mixture VAE: the paper's (Eqs. 7 to 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.objectives import GMVAELoss
+from torchrl_etl.synergies.model import SynergyModel
+
+__all__ = ["GMVAESynergies", "fit_gmvae"]
+
+
+class GMVAESynergies(SynergyModel):
+    """A :class:`~torchrl_etl.modules.GMVAE` and its loss.
+
+    Args:
+        low, high (Tensor): bounds of the action [n].
+        num_synergies (int): d.
+
+    Keyword Args:
+        num_components (int, optional): of the mixture. Default: d; 1 is an ordinary VAE.
+        hidden (sequence of int): widths of its layers.
+        lr (float): learning rate.
+        kl_weight, component_kl_weight (float): see :class:`~torchrl_etl.objectives.GMVAELoss`.
+        updates (int): of :meth:`fit`.
+    """
+
+    kind = "gmvae"
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        num_synergies: int,
+        *,
+        num_components: int | None = None,
+        hidden: Sequence[int] = (128, 128),
+        lr: float = 3e-3,
+        kl_weight: float = 1.0,
+        component_kl_weight: float = 1.0,
+        updates: int = 2000,
+    ) -> None:
+        self.num_synergies, self.lr, self._updates = num_synergies, lr, updates
+        self.model = GMVAE(
+            len(low),
+            num_synergies,
+            num_components,
+            low=low.tolist(),
+            high=high.tolist(),
+            hidden=hidden,
+        ).to(low.device)
+        self.loss = GMVAELoss(
+            self.model, kl_weight=kl_weight, component_kl_weight=component_kl_weight
+        )
+
+    def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
+        fit_gmvae(self.model, actions, updates=self._updates, lr=self.lr, on_update=on_update)
+
+    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
+        return SynergyDecoder.from_gmvae(self.model, actions, residual=residual)
+
+    def reconstruct(self, actions: Tensor) -> Tensor:
+        return self.model.reconstruct(actions)
+
+    def encode(self, decoder: SynergyDecoder, actions: Tensor) -> Tensor:
+        return decoder.encode(self.model, actions)
+
+
+def fit_gmvae(
+    gmvae: GMVAE,
+    actions: Tensor,
+    *,
+    updates: int,
+    batch_size: int = 256,
+    lr: float = 3e-3,
+    on_update: Callable[[], None] = lambda: None,
+) -> GMVAE:
+    """Train a GMVAE on an array of actions [N, n] by Eq. 9; returns it.
+
+    Args:
+        gmvae (GMVAE): trained in place.
+        actions (Tensor): [N, n], in action units.
+
+    Keyword Args:
+        updates, batch_size (int), lr (float): of Adam.
+        on_update (callable): called before every update; may raise to stop.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.analysis import variance_accounted_for
+        >>> _ = torch.manual_seed(0)
+        >>> actions = torch.tanh(torch.randn(2048, 2) @ torch.randn(2, 8))
+        >>> gmvae = fit_gmvae(GMVAE(8, latent_dim=2), actions, updates=300)
+        >>> variance_accounted_for(actions, gmvae.reconstruct(actions).detach()) > 0.8
+        True
+    """
+    loss = GMVAELoss(gmvae)
+    optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
+    for _ in range(updates):
+        on_update()
+        chosen = actions[torch.randint(len(actions), (batch_size,), device=actions.device)]
+        optimizer.zero_grad(set_to_none=True)
+        loss(TensorDict({"action": chosen}, [batch_size]))["loss_gmvae"].backward()
+        optimizer.step()
+    return gmvae

@@ -1,0 +1,54 @@
+"""What finds synergies in actions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_etl.modules import SynergyMap
+
+__all__ = ["SynergyModel"]
+
+
+class SynergyModel(ABC):
+    """Condenses actions of n actuators into d coefficients.
+
+    A subclass is a file of its own and an entry of
+    :data:`~torchrl_etl.synergies.SYNERGY_MODELS` (see ``docs/extend.md``). It is built from the
+    bounds of the action: ``Model(low, high, num_synergies, **options)``.
+
+    Attributes:
+        kind (str): its name in configurations and bundles.
+        loss (LossModule, optional): trained beside stage 1 on entry ``action``; ``None`` for a
+            model that is fitted once, when all actions are known.
+        lr (float): learning rate of the loss.
+    """
+
+    kind: ClassVar[str]
+    num_synergies: int
+    loss: LossModule | None = None
+    lr: float = 1e-3
+
+    @abstractmethod
+    def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
+        """Fit to actions [N, n], from anew.
+
+        Keyword Args:
+            on_update (callable): called now and then; may raise to stop.
+        """
+
+    @abstractmethod
+    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyMap:
+        """The map from coefficients in [-1, 1]^d to actions, which spans ``actions`` [N, n]."""
+
+    @abstractmethod
+    def reconstruct(self, actions: Tensor) -> Tensor:
+        """Actions [*, n] as d coefficients can tell them."""
+
+    def describe(self, actions: Tensor) -> dict[str, Any]:
+        """Facts that only this kind has, for the bundle."""
+        return {}

@@ -1,0 +1,164 @@
+"""What a method is handed of the run that it is part of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
+from torchrl.envs.transforms import Transform
+
+from torchrl_etl.collectors import VectorCollector
+from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.learners import SACLearner, build_learner
+from torchrl_etl.training.loop import StopOnSignal, run_stage
+from torchrl_etl.training.run_folder import RunFolder
+from torchrl_etl.training.stage import Stage
+
+__all__ = ["Context", "naming"]
+
+
+@dataclass(frozen=True)
+class Context:
+    """Configuration, folder and environment of a run, and how to build a stage for them.
+
+    Args:
+        config (DictConfig): see ``recipes/conf/config.yaml``.
+        folder (RunFolder): where the run leaves what it finds.
+        say (callable): where messages for a person go, one line each.
+    """
+
+    config: DictConfig
+    folder: RunFolder
+    say: Callable[[str], None] = lambda line: None
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device(self.config.device)
+
+    @cached_property
+    def spec(self) -> EnvironmentSpec:
+        """Sizes, bounds and names of the environment."""
+        return EnvironmentSpec.of(self.make_env(), self.device)
+
+    def options(self, section: str) -> dict[str, Any]:
+        """A section of the configuration as plain keyword arguments."""
+        return OmegaConf.to_container(OmegaConf.select(self.config, section), resolve=True)
+
+    def make_env(self, **options: Any) -> EnvBase:
+        """One simulator of the task."""
+        variant = {"goal": self.config.goal, "action_repeat": self.config.action_repeat}
+        return make_env(self.config.env, device=self.device, **{**variant, **options})
+
+    def learner(self, section: str = "learn", **parts: Any) -> SACLearner:
+        """The learner that ``section`` configures; for ``parts`` see ``build_learner``."""
+        options = self.options(section)
+        configured = {key: options[key] for key in ("actor", "critic", "sac", "noise")}
+        compile = self.config.compile
+        if compile is None:  # what it takes to begin must pay
+            compile = options["frames"] * options["replay_ratio"] >= 10_000
+        configured["sac"]["compile"] = compile
+        with naming(section):
+            return build_learner(
+                self.spec.observation_dim, self.spec.action_spec, **{**configured, **parts}
+            )
+
+    def stage(
+        self,
+        learner: SACLearner,
+        section: str = "learn",
+        *,
+        env_options: dict[str, bool] | None = None,
+        env_transforms: Sequence[Transform] = (),
+        **options: Any,
+    ) -> Stage:
+        """The stage that ``section`` configures, before its first frame.
+
+        Args:
+            learner (SACLearner): what learns in it.
+            section (str): ``"explore"`` or ``"learn"``.
+
+        Keyword Args:
+            env_options (dict): what the environment must also give, see
+                :func:`~torchrl_etl.envs.make_env`.
+            env_transforms (sequence of Transform): appended to it.
+            **options: in place of configured arguments of :class:`~torchrl_etl.training.Stage`.
+        """
+        collector = self.options("collector")
+        num_envs = collector.pop("num_envs")
+        collector["collector_class"] = VectorCollector if num_envs > 1 else Collector
+        collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
+        make_env = partial(
+            env_of_a_collector,
+            self.config.env,
+            goal=self.config.goal,
+            action_repeat=self.config.action_repeat,
+            num_envs=num_envs,
+            transforms=tuple(env_transforms),
+            **env_options or {},
+        )
+        configured = self.options(section)
+        for of_others in ("actor", "critic", "sac", "noise", "decoder", "prefill", "fit"):
+            configured.pop(of_others, None)
+        fixed = {
+            "name": section,
+            "seed": stage_seed(self.config.seed, section),
+            "device": self.device,
+            "action_repeat": self.config.action_repeat,
+            "scratch": self.folder.path / "buffer",
+            "collector": collector,
+        }
+        with naming(section):
+            return Stage(learner=learner, make_env=make_env, **{**configured, **fixed, **options})
+
+    def run_stage(self, stage: Stage, stop: StopOnSignal, **options: Any) -> Any:
+        """Run a stage to its end, see :func:`~torchrl_etl.training.loop.run_stage`."""
+        configured = {
+            "checkpoint_every": self.config.checkpoint.every,
+            "keep": self.config.checkpoint.keep,
+            "log_every": self.config.log_every,
+            "show_progress": self.config.progress,
+        }
+        return run_stage(stage, self.folder, stop, **{**configured, **options})
+
+    def seed_everything(self, section: str) -> int:
+        """Seed PyTorch for what ``section`` builds; returns the seed."""
+        seed = stage_seed(self.config.seed, section)
+        torch.manual_seed(seed)
+        return seed
+
+
+def stage_seed(seed: int, section: str) -> int:
+    """Seeds of the two stages never meet."""
+    return 2 * seed + (section != "explore")
+
+
+@contextmanager
+def naming(section: str) -> Iterator[None]:
+    """Put the section of the configuration before what an argument check says.
+
+    Examples:
+        >>> with naming("learn.sac"):
+        ...     raise ValueError("lr is 0; it must be a number above 0.")
+        Traceback (most recent call last):
+        ...
+        ValueError: learn.sac.lr is 0; it must be a number above 0.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise type(error)(f"{section}.{error}") from error
+
+
+def env_of_a_collector(name: str, transforms: Sequence[Transform], **kwargs: Any) -> TransformedEnv:
+    """Simulators with what the loop logs and what a stage needs; sent to workers as it is."""
+    own = [transform.clone() for transform in transforms]
+    return TransformedEnv(
+        make_env(name, **kwargs, device="cpu"), Compose(RewardSum(), InitTracker(), *own)
+    )
