@@ -16,15 +16,15 @@ from pathlib import Path
 
 import torch
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl_etl.training.synergy_report import fit_gmvae
 
 from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.command_line import quiet_torchrl
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
-from torchrl_etl.training.synergy_report import fit_gmvae
 
 EPISODES = 50
 UPDATES = 4000

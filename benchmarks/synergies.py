@@ -16,8 +16,8 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules.bundle import load_bundle
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.modules.bundle import load_bundle
 
 ROOT = Path(__file__).parent.parent
 READINGS = ("default", "paper")

@@ -35,10 +35,10 @@ from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules import make_actor, make_critic
-from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.objectives import LeanSACLoss
 from torchrl_etl.training.stage import Stage, make_optimizer, ready_for_training
 
 ROOT = Path(__file__).parent.parent

@@ -23,8 +23,8 @@ from omegaconf import DictConfig, ListConfig
 from rich.live import Live
 from rich.table import Table
 
-from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.checks import check_choice
+from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.training import Bench, Run, validate
 
 HERE = Path(__file__).parent

@@ -29,6 +29,16 @@ TINY = (
     "threads=1",
 )
 
+# What learner=plain takes away, given back to it.
+RESIDUAL = (
+    "actor.body=residual",
+    "critic.body=residual",
+    "learn.critic.bins=101",
+    "learn.sac.return_bound=5",
+    "learn.sac.normalize_observations=true",
+    "learn.noise.kind=held",
+)
+
 
 def tiny(*overrides: str, name: str = "config") -> DictConfig:
     """The tiny configuration with overrides."""

@@ -6,19 +6,30 @@ import torch
 from torch import nn
 
 from tests.configs import tiny
-from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.modules import SynergyDecoder
 
 
-def explore_stage(*overrides):
-    stage = Experiment(tiny("run_dir=unused", *overrides)).explore_stage()
+def explorer(*overrides):
+    """Stage 1, its exploration and its synergy model."""
+    found = Explorer(Experiment(tiny("run_dir=unused", *overrides)).context)
+    found.stage.restart_collection()
+    return found
+
+
+def learn_stage(decoder=None, *overrides):
+    """Stage 2 of ETL."""
+    decoder = decoder or SynergyDecoder(2, 16, hidden=(32, 32))
+    stage = Experiment(tiny("run_dir=unused", *overrides)).method.learn_stage(decoder)
     stage.restart_collection()
     return stage
 
 
-def learn_stage(decoder=None, *overrides):
-    decoder = decoder or SynergyDecoder(2, 16, hidden=(32, 32))
-    stage = Experiment(tiny("run_dir=unused", *overrides)).learn_stage(decoder)
+def method_stage(method, *overrides):
+    """The stage of a method that learns the task."""
+    overrides = (f"method={method}", "run_dir=unused", *overrides)
+    stage = Experiment(tiny(*overrides)).method.stage()
     stage.restart_collection()
     return stage
 

@@ -16,9 +16,9 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from tests.configs import tiny
 from torchrl_etl.baselines.sar import SARDecoder, best_episodes
 from torchrl_etl.envs import make_env
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
-from torchrl_etl.experiment import Experiment
 from torchrl_etl.transforms import SynergyAction
 
 MUSCLES, SYNERGIES = 7, 3
@@ -333,7 +333,7 @@ def test_the_decoder_loss_of_its_own_actions_is_zero() -> None:
 @pytest.mark.parametrize("blend", [1.0, 0.66])
 def test_the_learn_stage_learns_through_it(blend: float) -> None:
     decoder = overactuated_decoder(blend)
-    overrides = ("run_dir=unused", "learn.fine_tuning=frozen")
+    overrides = ("run_dir=unused", "learn.decoder.fine_tuning=frozen")
     stage = Experiment(tiny(*overrides)).learn_stage(decoder)
     stage.restart_collection()
     try:

@@ -15,13 +15,13 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import RewardSum, TransformedEnv
+from torchrl_etl.training.sac import episodes
 
 from tests.point_env import PointTask
 from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import make_actor
-from torchrl_etl.training.sac import episodes
 
 FRAMES = 48
 

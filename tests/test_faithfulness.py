@@ -12,13 +12,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from tests.configs import CONF, ROOT, tiny
-from torchrl_etl.experiment import Experiment
-from torchrl_etl.training.explore import ExploreStage
+from tests.configs import CONF, ROOT
+from tests.stages import explorer, fill
+from torchrl_etl.methods.etl import Explorer
 
 PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")
 TEST = re.compile(r"(tests/\w+\.py)::(\w+)")
-SETTING = re.compile(r"`(\+?(?:explore|learn)\.[\w.]+=[\w.]+)`")
+SETTING = re.compile(r"`(\+?(?:explore|exploration|synergies|learn)\.[\w.]+=[\w.]+)`")
 
 
 def owners() -> Iterator[tuple[str, str]]:
@@ -52,13 +52,11 @@ def flat(config: DictConfig, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}={typed}"
 
 
-def explore_stage(*overrides: str) -> ExploreStage:
-    stage = Experiment(tiny("run_dir=unused", *overrides)).explore_stage()
-    stage.restart_collection()
-    for _ in range(4):
-        stage.collect()
-    stage.close()
-    return stage
+def explored(*overrides: str) -> Explorer:
+    found = explorer(*overrides)
+    fill(found.stage, 4)
+    found.stage.close()
+    return found
 
 
 @pytest.mark.parametrize(("file", "owner"), list(owners()), ids=lambda value: value)
@@ -102,35 +100,36 @@ def test_every_setting_on_the_page_is_accepted_as_written(setting):
 
 
 def test_the_paper_preset_reaches_the_parts_it_is_about():
-    paper = explore_stage("faithful=paper")
-    paper.update()
-    assert paper.bonus.deviation is None
-    assert paper.metric.regularizer == "literal"
-    assert paper.redraw.share == 0
-    direction = paper.buffer.storage[:]["direction"]
-    assert ((direction == 0) | (direction == 1)).all()
-    kept = paper.buffer.storage[:]
+    paper = explored("faithful=paper")
+    paper.stage.update()
+    relabel, bonus = paper.exploration.batch_transforms()
+    assert bonus.deviation is None
+    assert paper.stage.learner.objective.terms[0].loss.regularizer == "literal"
+    assert relabel.share == 0
+    kept = paper.stage.buffer.storage[:]
+    assert ((kept["direction"] == 0) | (kept["direction"] == 1)).all()
     torch.testing.assert_close(paper.actions(), kept["action"])
 
 
 def test_embedding_size_follows_the_synergies_unless_given():
-    assert explore_stage("num_synergies=3").encoder.embedding_dim == 3
-    other = explore_stage("num_synergies=3", "explore.encoder.embedding_dim=5")
-    assert other.encoder.embedding_dim == 5
-    assert other.buffer.storage[:]["direction"].shape[-1] == 5
+    assert explored("num_synergies=3").exploration.encoder.embedding_dim == 3
+    other = explored("num_synergies=3", "exploration.encoder.embedding_dim=5")
+    assert other.exploration.encoder.embedding_dim == 5
+    assert other.stage.buffer.storage[:]["direction"].shape[-1] == 5
 
 
 def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
-    stage = explore_stage()
+    stage = explored().stage
     batch = stage.buffer.sample()
+    objective = stage.learner.objective
 
     def metric_and_critic(key: str, factor: float) -> tuple[float, float]:
         changed = batch.clone()
         changed["next", key] = factor * changed["next", key]
         torch.manual_seed(0)
-        metric = stage.metric(changed)["loss_metric"].item()
+        metric = objective.terms[0].loss(changed)["loss_metric"].item()
         torch.manual_seed(0)
-        return metric, stage.sac(changed)["loss_qvalue"].item()
+        return metric, objective.sac(changed)["loss_qvalue"].item()
 
     metric, critic = metric_and_critic("reward", 1.0)
     with_reward, with_bonus = (
@@ -143,14 +142,16 @@ def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
 
 @pytest.mark.parametrize(("updates", "trained"), [(0, False), (3, True)])
 def test_the_gmvae_is_trained_on_after_the_last_frame_unless_told_not_to(updates, trained):
-    stage = explore_stage(f"explore.fit.final_updates={updates}")
-    before = stage.gmvae.prior_loc.clone()
-    stage.finish()
-    assert (not torch.equal(stage.gmvae.prior_loc, before)) is trained
+    found = explored(f"explore.fit.final_updates={updates}")
+    before = found.model.model.prior_loc.clone()
+    found.condense()
+    assert (not torch.equal(found.model.model.prior_loc, before)) is trained
 
 
 def test_entropy_target_of_stage_1_is_sacs_usual_under_the_paper_preset():
-    usual = explore_stage("explore.sac.action_std=null").sac.target_entropy
+    usual = explored("explore.sac.action_std=null").stage.learner.objective.sac.target_entropy
     assert usual.item() == pytest.approx(-16.0)
     # 16 muscles, each ln(0.15 * sqrt(2 * pi * e)).
-    assert explore_stage().sac.target_entropy.item() == pytest.approx(16 * -0.47818, abs=1e-3)
+    assert explored().stage.learner.objective.sac.target_entropy.item() == pytest.approx(
+        16 * -0.47818, abs=1e-3
+    )

@@ -7,8 +7,9 @@ import torch
 
 from tests.configs import tiny
 from torchrl_etl.envs import AnalyticOveractuated
-from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
 
 
@@ -24,19 +25,20 @@ def test_stage_1_finds_actions_in_the_subspace_that_moves_the_joints(basis):
         tiny(
             "run_dir=unused",
             "goal=random",
-            "explore.bonus.extrinsic_weight=1",  # at 4 it finds none here (docs/results/log.md, 69)
+            "exploration.bonus.extrinsic_weight=1",  # at 4: none (docs/results/log.md, 69)
             "explore.frames=3000",
-            "explore.updates_per_frame=0.5",
+            "explore.replay_ratio=0.5",
             "explore.batch_size=128",
         )
     )
-    stage = experiment.explore_stage()
+    explorer = Explorer(experiment.context)
+    stage = explorer.stage
     stage.restart_collection()
     while not stage.finished:
         stage.collect()
         stage.learn()
     stage.close()
-    actions = stage.actions(1500)
+    actions = explorer.actions(1500)
     deviation = actions - actions.mean(0)
     share = (deviation @ basis.T).square().sum() / deviation.square().sum()
     assert share > 4 * 2 / 16  # actions without direction have 2/16 of their variance there
@@ -56,14 +58,14 @@ def test_stage_2_solves_the_task_in_the_known_synergies(basis):
             "evaluation.episodes=10",
             "learn.frames=3500",
             "learn.batch_size=128",
-            "learn.updates_per_frame=0.5",
+            "learn.replay_ratio=0.5",
             "learn.reward_scale=1.0",
             "learn.sac.gamma=0.9",
             "learn.sac.lr=1e-3",
             "learn.sac.tau=0.01",
         )
     )
-    stage = experiment.learn_stage(SynergyDecoder.from_gmvae(gmvae, actions))
+    stage = experiment.method.learn_stage(SynergyDecoder.from_gmvae(gmvae, actions))
     evaluate = experiment.evaluator(stage)
     assert evaluate().solved.mean < 0.3
     stage.restart_collection()

@@ -18,9 +18,9 @@ from benchmarks.many_runs.learner import Learner
 from benchmarks.many_runs.returns import ReturnScales
 from benchmarks.many_runs.settings import Settings, Shape
 from tests.configs import ROOT, tiny
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
-from torchrl_etl.experiment import Experiment
 from torchrl_etl.training.evaluation import evaluate
 from torchrl_etl.training.stage import entropy_target, ready_for_training
 
@@ -151,7 +151,7 @@ def test_targets_of_three_steps_by_hand():
 
 
 def test_what_was_explored_is_given_as_in_the_recipe(tmp_path):
-    options = ("learn.reuse_exploration=true", "learn.reward_scale=1", "frames=601")
+    options = ("learn.prefill=true", "learn.reward_scale=1", "frames=601")
     experiment = Experiment(tiny(*options, f"run_dir='{tmp_path}/run'"))
     experiment.run()
     run = {"seed": 0, "synergies": tmp_path / "run" / "synergies"}

@@ -137,7 +137,9 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", ["env=Walker2d-v5", "faithful=paper", "learn.residual=0.2"])
+@pytest.mark.parametrize(
+    "options", ["env=Walker2d-v5", "faithful=paper", "learn.decoder.residual=0.2"]
+)
 def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path):
     done = run("etl_sac.py", *TINY, *options.split(), f"run_dir='{tmp_path}/run'", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -9,9 +9,9 @@ import torch
 
 from tests.configs import CONF, tiny
 from torchrl_etl.envs import list_tasks
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config, validate
 
 GROUPS = {
@@ -43,36 +43,36 @@ def test_every_task_of_the_paper_is_valid(task):
         ("num_synergies=17", "overactuated has 16 actuators; choose at most that many"),
         ("explore.frames=-5", "explore.frames is -5; it must be a whole number above 0"),
         ("learn.frames=many", "learn.frames is 'many'; it must be a whole number above 0"),
-        ("learn.updates_per_frame=0", "learn.updates_per_frame is 0"),
+        ("learn.replay_ratio=0", "learn.replay_ratio is 0"),
         ("seed=-1", "seed is -1; it must be a whole number from 0"),
         ("seed=0.5", "seed is 0.5"),
         ("collector.frames_per_batch=33", "it must be a multiple of their number"),
         ("checkpoint.keep=1", "checkpoint.keep is 1; it must be a whole number above 1"),
         ("explore.fit.best_share=0", "explore.fit.best_share is 0; it must be a share in (0, 1]"),
         ("explore.fit.best_share=0.5", "use explore.fit.actions=mean"),
-        ("explore.redraw=2", "explore.redraw is 2; it must be a share in [0, 1]"),
+        ("exploration.relabel=2", "exploration.relabel is 2; it must be a share in [0, 1]"),
         ("explore.fit.actions=loc", "policy, mean, sampled, activation"),
-        ("learn.fine_tuning=freeze", "nearest: frozen"),
-        ("learn.residual=2", "learn.residual is 2; it must be a share in [0, 1]"),
+        ("learn.decoder.fine_tuning=freeze", "nearest: frozen"),
+        ("learn.decoder.residual=2", "learn.decoder.residual is 2; it must be a share in [0, 1]"),
         ("explore.fit.final_updates=0.5", "explore.fit.final_updates is 0.5"),
         ("evaluation.episodes=1.5", "evaluation.episodes is 1.5"),
-        ("learn.decoder_lr=null", "learn.decoder_lr is None; it must be a number above 0"),
-        ("learn.decoder_lr=-1", "learn.decoder_lr is -1"),
+        ("learn.decoder.lr=null", "learn.decoder.lr is None; it must be a number above 0"),
+        ("learn.decoder.lr=-1", "learn.decoder.lr is -1"),
         ("learn.anchor=nan", "learn.anchor is nan"),
         ("learn.batch_size=1", "learn.batch_size is 1; it must be a whole number above 1"),
         ("explore.reward_scale=abc", "explore.reward_scale is 'abc'"),
         ("explore.sac.action_std=0", "a number above 0 or null"),
-        ("explore.direction.kind=foo", "sphere"),
-        ("explore.direction.num_directions=3 explore.direction.kind=orthonormal", "3"),
+        ("exploration.direction.kind=foo", "sphere"),
+        ("exploration.direction.num_directions=3 exploration.direction.kind=orthonormal", "3"),
         ("explore.fit.actions=activation", "activation"),
         ("learn.critic.bins=51", "which needs a bound on returns"),
-        ("learn.sac.noise=hold", "choose one of independent, held"),
+        ("learn.noise.kind=hold", "choose one of independent, held"),
         ("learn.sac.num_critics=0", "num_critics is 0; it must be a whole number above 0"),
         ("learn.sac.hold.exponent=0", "learn.sac.hold.exponent is 0; it must be a number above 0"),
         ("learn.sac.hold.longest=x", "longest is 'x'; it must be a whole number above 0"),
         ("learn.sac.lr_end=2", "lr_end is 2; it must be a share in [0, 1]"),
-        ("learn.sac.n_steps=0", "n_steps is 0; it must be a whole number above 0"),
-        ("learn.sac.actor_average=1", "actor_average is 1; it must be a share in [0, 1)"),
+        ("learn.n_steps=0", "n_steps is 0; it must be a whole number above 0"),
+        ("learn.sac.ema_decay=1", "actor_average is 1; it must be a share in [0, 1)"),
         ("learn.sac.unit_rows=1", "unit_rows is 1; it must be true or false"),
         ("critic.body=resnet", "choose one of mlp, residual"),
         ("frames=10", "frames is 10, of which 600 go into"),
@@ -91,7 +91,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("synergies=nowhere", "nowhere"),
         ("device=gpu", "device is 'gpu'; use cpu, cuda or cuda:0"),
         ("log=[csv,tensorbord]", "nearest: tensorboard"),
-        ("explore.metric.regularizer=hing", "hinge"),
+        ("exploration.metric.regularizer=hing", "hinge"),
     ],
 )
 def test_a_fault_is_named_with_its_remedy_before_anything_runs(override, words, tmp_path):

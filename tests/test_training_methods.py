@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl_etl.training.methods import PlayStage
 
 from tests.configs import CONF, tiny
 from tests.test_training_resume import numbers
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.training.methods import PlayStage
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from torchrl_etl.training.learn import LearnStage
 
 from tests.configs import ROOT, TINY, tiny
-from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
-from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.stage import Stage
 
 WALL_CLOCK = ("frames_per_second", "wall_seconds")
@@ -30,7 +30,7 @@ REMEMBERS = (
     "learn.sac.normalize_observations=true",
     "learn.sac.return_bound=5",
     "learn.sac.lr_end=0.5",
-    "learn.sac.actor_average=0.9",
+    "learn.sac.ema_decay=0.9",
 )
 
 
@@ -146,8 +146,8 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
     tmp_path, monkeypatch
 ):
     learner = (
-        *("method=sac", "actor.body=residual", "learn.critic.bins=11", "learn.sac.noise=held"),
-        *("learn.sac.return_bound=5", "learn.updates_per_frame=0.5", "frames=608"),
+        *("method=sac", "actor.body=residual", "learn.critic.bins=11", "learn.noise.kind=held"),
+        *("learn.sac.return_bound=5", "learn.replay_ratio=0.5", "frames=608"),
     )
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     Experiment(tiny(f"run_dir='{whole}'", *learner)).run()
@@ -246,7 +246,7 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
 
 def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_path, monkeypatch):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(f"run_dir='{run}'", "learn.reuse_exploration=true"))
+    experiment = Experiment(tiny(f"run_dir='{run}'", "learn.prefill=true"))
     update, updates = LearnStage.update, []
 
     def update_and_signal(self):

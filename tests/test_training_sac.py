@@ -11,38 +11,33 @@ from torch import nn
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from tests.configs import tiny
-from tests.stages import changed, fill, learn_stage, snapshot
-from torchrl_etl.experiment import Experiment
+from tests.configs import RESIDUAL
+from tests.stages import changed, fill, learn_stage, method_stage, snapshot
 
 
 def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
-    settings = ("method=sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
-    stage = Experiment(tiny("run_dir=unused", *settings)).learn_stage(None)
-    stage.restart_collection()
+    stage = method_stage("sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
     fill(stage)
     seen = {}
-    stage.sac.register_forward_pre_hook(
+    stage.learner.objective.sac.register_forward_pre_hook(
         lambda _, args: seen.update(reward=args[0]["next", "reward"])
     )
     torch.manual_seed(0)
     kept = stage.buffer.sample()["next", "reward"]
     torch.manual_seed(0)
-    before = snapshot(stage.policy)
+    before = snapshot(stage.learner.behavior)
     stage.update()
-    scale = stage.return_scale.scale.float()
+    scale = stage.learner.objective.return_scale.scale.float()
     assert scale != 1 and torch.allclose(seen["reward"], kept / scale)
-    assert changed(stage.policy, before)
-    assert stage.policy.out_keys[-1] == "action" and stage.action_spec.shape == (16,)
+    assert changed(stage.learner.behavior, before)
+    assert stage.learner.behavior.out_keys[-1] == "action"
     stage.close()
 
 
 @pytest.mark.parametrize("layout", [(16,), (2, 8), (2, 2, 4)])
 def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
     """[time] of one simulator, [simulators, time], [workers, simulators, time]."""
-    settings = ("method=sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
-    stage = Experiment(tiny("run_dir=unused", *settings)).learn_stage(None)
-    stage.restart_collection()
+    stage = method_stage("sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
     batch = stage.batches.next().reshape(-1)[:16].reshape(layout)
     batch["next", "reward"] = torch.arange(16.0).reshape(*layout, 1)
     batch["next", "done"] = torch.zeros(*layout, 1, dtype=torch.bool)
@@ -52,25 +47,26 @@ def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
     for rewards in torch.arange(16.0).reshape(-1, layout[-1]).tolist():
         earned = 0.0
         for reward in rewards:
-            returns.append(earned := reward + stage.return_scale.gamma * earned)
-    assert stage.return_scale.largest.item() == pytest.approx(max(returns))
-    assert stage.return_scale.mean.item() == pytest.approx(sum(returns) / 16)
+            returns.append(earned := reward + stage.learner.objective.return_scale.gamma * earned)
+    assert stage.learner.objective.return_scale.largest.item() == pytest.approx(max(returns))
+    assert stage.learner.objective.return_scale.mean.item() == pytest.approx(sum(returns) / 16)
     stage.close()
 
 
 @pytest.mark.parametrize("method", ["sac", "etl", "lattice", "dynsyn", "eme", "sar"])
 def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp_path):
-    settings = (f"method={method}", "learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
-    experiment = Experiment(tiny(*settings))
-    blank = experiment.blank_decoder() if method == "etl" else None
-    stage = experiment.learn_stage(blank)
-    stage.restart_collection()
+    settings = ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
+    stage = method_stage(method, *settings)
     fill(stage)
     seen = {}
-    stage.sac.register_forward_pre_hook(lambda _, args: seen.update(args[0].flatten_keys(".")))
-    statistics = snapshot(stage.norm)
+    stage.learner.objective.sac.register_forward_pre_hook(
+        lambda _, args: seen.update(args[0].flatten_keys("."))
+    )
+    statistics = snapshot(stage.learner.objective.normalizer)
     stage.update()
-    assert not changed(stage.norm, statistics), "sampling a batch is not seeing new observations"
+    assert not changed(stage.learner.objective.normalizer, statistics), (
+        "sampling a batch is not seeing new observations"
+    )
     raw = stage.buffer.storage[:]["observation"].double()
     mean, std = raw.mean(0), raw.std(0, correction=0)
     for prefix in ("", "next."):
@@ -79,9 +75,11 @@ def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp
     # What acts, in training and in evaluation, reads raw observations and scales them alike.
     observation = {"observation": raw[:5].float()}
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        acted = stage.trained_policy(TensorDict(observation, [5]))
-    torch.testing.assert_close(acted["normalized_observation"], stage.norm(raw[:5].float()))
-    assert "observation" not in stage.actor.in_keys
+        acted = stage.learner.policy(TensorDict(observation, [5]))
+    torch.testing.assert_close(
+        acted["normalized_observation"], stage.learner.objective.normalizer(raw[:5].float())
+    )
+    assert "observation" not in stage.learner.actor.in_keys
     stage.close()
 
 
@@ -89,16 +87,15 @@ def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp
 @pytest.mark.parametrize(("engine", "oldest"), [("single", 1), ("process", 1), ("distributed", 2)])
 def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
     # A worker on another machine is asked for a batch before the last one is learned from.
-    settings = ("method=sac", f"collector={engine}", "collector.ahead=false")
+    settings = (f"collector={engine}", "collector.ahead=false")
     settings += () if engine == "single" else ("collector.num_workers=1",)
     settings += ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
-    stage = Experiment(tiny(*settings)).learn_stage(None)
+    stage = method_stage("sac", *settings)
     try:
-        stage.restart_collection()
         known = []
         for _ in range(6):
             stage.collect()
-            known.append(copy.deepcopy(stage.norm))
+            known.append(copy.deepcopy(stage.learner.objective.normalizer))
         batch = stage.batches.next()
         acted = batch["normalized_observation"]
         assert any(torch.allclose(acted, norm(batch["observation"])) for norm in known[-oldest:])
@@ -110,53 +107,55 @@ def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, o
 def test_there_are_as_many_critics_as_were_asked_for(number):
     stage = learn_stage(None, f"learn.sac.num_critics={number}")
     fill(stage)
-    weights = stage.sac.qvalue_network_params.flatten_keys().values()
+    weights = stage.learner.objective.sac.qvalue_network_params.flatten_keys().values()
     assert {len(weight) for weight in weights} == {number}
     assert stage.update()["loss_qvalue"].isfinite()
     stage.close()
 
 
 def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(tmp_path):
-    settings = ("learn.sac.unit_rows=true", "learner=residual", f"run_dir={tmp_path}")
+    settings = ("learn.sac.unit_rows=true", *RESIDUAL, f"run_dir={tmp_path}")
     stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     fill(stage)
     stage.update()
-    linear = [m.weight for m in stage.actor.modules() if isinstance(m, nn.Linear)]
-    critics = stage.sac.qvalue_network_params
+    linear = [m.weight for m in stage.learner.actor.modules() if isinstance(m, nn.Linear)]
+    critics = stage.learner.objective.sac.qvalue_network_params
     stacked = [p for p in critics.parameters() if p.ndim == 3]
     assert len(linear) == len(stacked) == 6  # in, two in each of two blocks, out
     for weight in (*linear, *stacked):
         torch.testing.assert_close(weight.norm(dim=-1), torch.ones(weight.shape[:-1]))
-    norms = [m.weight for m in stage.actor.modules() if isinstance(m, nn.LayerNorm)]
+    norms = [m.weight for m in stage.learner.actor.modules() if isinstance(m, nn.LayerNorm)]
     assert all(abs(norm.norm() - 4.0) < 0.1 for norm in norms)  # √16: as they started
     stage.close()
 
 
 def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns():
-    stage = learn_stage(None, "learn.sac.actor_average=0.25")
+    stage = learn_stage(None, "learn.sac.ema_decay=0.25")
     fill(stage)
-    averaged = list(stage.trained_policy.parameters())
+    averaged = list(stage.learner.policy.parameters())
     expected = None
     for kept in (0, 2 / 11, 3 / 12, 0.25, 0.25):  # (1 + n) / (10 + n), then the share
         stage.update()
-        actor = [weight.detach().clone() for weight in stage.actor.parameters()]
+        actor = [weight.detach().clone() for weight in stage.learner.actor.parameters()]
         expected = expected or actor
         expected = [torch.lerp(new, old, kept) for old, new in zip(expected, actor, strict=True)]
         torch.testing.assert_close(averaged, expected)
-    assert {id(weight) for weight in stage.policy.parameters()} >= set(
-        map(id, stage.actor.parameters())
+    assert {id(weight) for weight in stage.learner.behavior.parameters()} >= set(
+        map(id, stage.learner.actor.parameters())
     )
-    assert not {id(weight) for weight in stage.policy.parameters()} & set(map(id, averaged))
+    assert not {id(weight) for weight in stage.learner.behavior.parameters()} & set(
+        map(id, averaged)
+    )
     stage.close()
 
 
 def test_an_average_that_keeps_nothing_is_the_actor():
-    stage = learn_stage(None, "learn.sac.actor_average=0")
+    stage = learn_stage(None, "learn.sac.ema_decay=0")
     fill(stage)
     stage.update()
     stage.update()
     for averaged, weight in zip(
-        stage.trained_policy.parameters(), stage.actor.parameters(), strict=True
+        stage.learner.policy.parameters(), stage.learner.actor.parameters(), strict=True
     ):
         assert torch.equal(averaged, weight)
     stage.close()
@@ -180,59 +179,55 @@ def spans(rows):
 
 
 def test_a_transition_spans_n_steps_but_no_end_of_an_episode():
-    stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
+    stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
     batch = six_steps(ends_after=3)
-    spanned = stage.spanned(batch)
+    spanned = stage.multi_step(batch)
     # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4; the last two wait.
     assert spans(spanned) == [(0, 2.75, 3, 3), (1, 3.5, 3, 2), (2, 3.0, 3, 1), (3, 8.0, 6, 3)]
     for end in ("terminated", "done"):
         assert spanned["next", end].flatten().tolist() == [True, True, True, False]
     assert batch["next", "reward"].flatten().tolist() == [1, 2, 3, 4, 5, 6], "logs read the batch"
     # The target: rewards and, unless the episode ended, γ^k times what follows, here 8.
-    target = stage.sac._bootstrap(spanned, torch.full((4,), 8.0))
+    target = stage.learner.objective.sac._bootstrap(spanned, torch.full((4,), 8.0))
     assert target.tolist() == [2.75, 3.5, 3.0, 9.0]
     stage.close()
 
 
 def test_a_transition_spans_steps_of_the_next_batch_if_that_goes_on():
     for size in (1, 2, 6):  # of the batches that the same 18 steps come in
-        stage = learn_stage(None, "learn.sac.n_steps=3", "learn.sac.gamma=0.5")
+        stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
         steps = torch.cat([six_steps(ends_after=3, begins=k) for k in (0, 6, 12)], 1)
-        rows = torch.cat([stage.spanned(part) for part in steps.split(size, 1)])
+        rows = torch.cat([stage.multi_step(part) for part in steps.split(size, 1)])
         whole = MultiStep.forward(stage.multi_step, steps)
         assert spans(rows) == spans(whole)[:16]
         # Episodes begin anew, as after a checkpoint: what waits is dropped.
         stage.restart_collection()
-        assert spans(stage.spanned(six_steps(ends_after=3)))[0] == (0, 2.75, 3, 3)
+        assert spans(stage.multi_step(six_steps(ends_after=3)))[0] == (0, 2.75, 3, 3)
         # Another worker's batch: what waits spans the steps that are known.
-        other = spans(stage.spanned(six_steps(ends_after=0, begins=50)))
+        other = spans(stage.multi_step(six_steps(ends_after=0, begins=50)))
         assert other[:3] == [(4, 8.0, 6, 2), (5, 6.0, 6, 1), (50, 51 + 52 / 2 + 53 / 4, 53, 3)]
         stage.close()
 
 
 def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many():
     stage = learn_stage(None)
-    batch = six_steps(ends_after=3)
-    assert (stage.spanned(batch) == batch.reshape(-1)).all()
     fill(stage)
     assert "steps_to_next_obs" not in stage.buffer.storage[:].keys()
     stage.close()
-    stage = learn_stage(None, "learn.sac.n_steps=3")
+    stage = learn_stage(None, "learn.n_steps=3")
     fill(stage)
     rows = stage.buffer.storage[:].clone()
     assert set(rows["steps_to_next_obs"].flatten().tolist()) == {1, 2, 3}
     assert stage.update()["loss_qvalue"].isfinite()
     # What stage 1 has collected is of single steps.
-    stage.take(rows.select("observation", "synergy", "action", "next"))
+    stage.prefill(rows.select("observation", "synergy", "action", "next"))
     assert set(stage.newest(len(rows))["steps_to_next_obs"].flatten().tolist()) == {1}
     assert stage.update()["loss_qvalue"].isfinite()
     stage.close()
 
 
 def test_the_bonus_of_eme_stays_one_of_single_steps():
-    stage = Experiment(tiny("method=eme", "learn.sac.n_steps=3", "run_dir=unused"))
-    stage = stage.learn_stage(None)
-    stage.restart_collection()
+    stage = method_stage("eme", "learn.n_steps=3")
     fill(stage)
     assert set(stage.buffer.storage[:]["steps_to_next_obs"].flatten().tolist()) == {1}
     assert stage.update()["loss_qvalue"].isfinite()
@@ -241,12 +236,12 @@ def test_the_bonus_of_eme_stays_one_of_single_steps():
 
 def test_learning_rates_fall_in_a_line_with_the_frames():
     stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
-    initial = [group["lr"] for group in stage.optimizer.param_groups]
+    initial = [group["lr"] for group in stage.learner.optimizer.param_groups]
     while not stage.finished:
         stage.collect()
         stage.learn()
-        share = 1 - 0.5 * stage.frames / 640 if stage.progress.updates else 1.0
-        rates = [group["lr"] for group in stage.optimizer.param_groups]
+        share = 1 - 0.5 * stage.frames / 640
+        rates = [group["lr"] for group in stage.learner.optimizer.param_groups]
         assert rates == pytest.approx([share * lr for lr in initial])
     assert share == pytest.approx(0.5)
     stage.close()

@@ -9,26 +9,27 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.configs import tiny
-from tests.stages import changed, explore_stage, fill, learn_stage, snapshot
+from tests.configs import RESIDUAL, tiny
+from tests.stages import changed, explorer, fill, learn_stage, snapshot
 from torchrl_etl.envs import AnalyticOveractuated
-from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
 
 
 def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_updates(tmp_path):
-    settings = ("learn.reuse_exploration=true", "learn.residual=0.5", "learn.reward_scale=3")
+    settings = ("learn.prefill=true", "learn.decoder.residual=0.5", "learn.reward_scale=3")
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings))
     experiment.run()
-    stage, decoder = experiment.learn_stage(experiment._decoder()[0]), experiment._decoder()[0]
+    stage, (decoder, _) = experiment.method.stage(), experiment.method.decoder()
     stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
     rows = stage.buffer.storage[:]
     assert len(rows) == 600 + 608
     own = (608 - 96) * 0.25  # none for the batches up to 100 frames
     assert stage.progress.updates == own + 600 * 0.25
     first = rows[:600]
-    explored = experiment.explore_stage()
+    explored = Explorer(experiment.context).stage
     explored.checkpoint().load(
         max((tmp_path / "run" / "checkpoints" / "explore").glob("checkpoint-*"))
     )
@@ -41,11 +42,11 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
 
 
 def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
-    first, second = explore_stage("action_repeat=2"), learn_stage(None, "action_repeat=2")
-    first.collect()
-    second.take(first.explored(second.decoder))
-    assert second.progress.owed == 2 * 32 * second.updates_per_frame
-    first.close(), second.close()
+    found, second = explorer("action_repeat=2"), learn_stage(None, "action_repeat=2")
+    found.stage.collect()
+    second.prefill(found.transitions(second.learner.decoder))
+    assert second.progress.owed == 2 * 32 * second.replay_ratio
+    found.stage.close(), second.close()
 
 
 def test_coefficients_of_decoded_actions_are_found_again():
@@ -61,18 +62,23 @@ def test_coefficients_of_decoded_actions_are_found_again():
 
 
 def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
-    stage = explore_stage()
+    found = explorer()
+    stage = found.stage
     fill(stage)
-    before = [snapshot(part) for part in (stage.policy, stage.encoder, stage.gmvae)]
+    before = [
+        snapshot(part)
+        for part in (stage.learner.behavior, found.exploration.encoder, found.model.model)
+    ]
     stage.update()
-    assert changed(stage.policy, before[0])
-    assert changed(stage.encoder, before[1])
-    assert changed(stage.gmvae, before[2])
+    assert changed(stage.learner.behavior, before[0])
+    assert changed(found.exploration.encoder, before[1])
+    assert changed(found.model.model, before[2])
     stage.close()
 
 
 def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
-    stage = explore_stage("explore.bonus.normalize=false", "explore.bonus.extrinsic_weight=0")
+    found = explorer("exploration.bonus.normalize=false", "exploration.bonus.extrinsic_weight=0")
+    stage = found.stage
     fill(stage)
 
     def bonus_and_expected():
@@ -80,7 +86,7 @@ def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
         batch = stage.buffer.sample()
         with torch.no_grad():
             phi, phi_next = (
-                stage.encoder.module(batch.get(key))
+                found.exploration.encoder.module(batch.get(key))
                 for key in ("observation", ("next", "observation"))
             )
         expected = ((phi_next - phi) * batch["direction"]).sum(-1, keepdim=True)
@@ -89,7 +95,7 @@ def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
     first, expected = bonus_and_expected()
     torch.testing.assert_close(first, expected)
     with torch.no_grad():
-        for parameter in stage.encoder.parameters():
+        for parameter in found.exploration.encoder.parameters():
             parameter.mul_(1.5)
     second, expected = bonus_and_expected()
     torch.testing.assert_close(second, expected)
@@ -98,7 +104,8 @@ def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
 
 
 def test_directions_are_unit_vectors_kept_through_the_episode():
-    stage = explore_stage()
+    found = explorer()
+    stage = found.stage
     batch = stage.collect()
     torch.testing.assert_close(batch["direction"].norm(dim=-1), torch.ones(len(batch)))
     inside = ~batch["next", "done"].squeeze(-1)
@@ -108,25 +115,28 @@ def test_directions_are_unit_vectors_kept_through_the_episode():
 
 @pytest.mark.parametrize("actions", ["policy", "mean", "sampled"])
 def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
-    stage = explore_stage(f"explore.fit.actions={actions}", "explore.redraw=0")
+    found = explorer(f"explore.fit.actions={actions}", "exploration.relabel=0")
+    stage = found.stage
     batch = stage.collect()
     with torch.no_grad():  # as learning would
-        for parameter in stage.policy.parameters():
+        for parameter in stage.learner.behavior.parameters():
             parameter.mul_(1.5)
-        now = stage.policy(batch.select("observation", "direction"))["loc"]
+        now = stage.learner.behavior(batch.select("observation", "direction"))["loc"]
     expected = {"policy": now.tanh(), "mean": batch["loc"].tanh(), "sampled": batch["action"]}
-    torch.testing.assert_close(stage.actions(), expected[actions], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found.actions(), expected[actions], atol=1e-5, rtol=1e-5)
     stage.close()
 
 
 def test_an_update_learns_for_directions_that_nobody_followed():
-    stage = explore_stage()
+    found = explorer()
+    stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
     drawn = {tuple(row) for row in stage.buffer.sample()["direction"].tolist()}
     assert not followed & drawn
     stage.close()
-    stage = explore_stage("explore.redraw=0")
+    found = explorer("exploration.relabel=0")
+    stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
     assert {tuple(row) for row in stage.buffer.sample()["direction"].tolist()} <= followed
@@ -134,15 +144,16 @@ def test_an_update_learns_for_directions_that_nobody_followed():
 
 
 def test_the_better_share_is_the_better_rewarded_one():
-    stage = explore_stage("explore.fit.best_share=0.25", "explore.fit.actions=mean")
+    found = explorer("explore.fit.best_share=0.25", "explore.fit.actions=mean")
+    stage = found.stage
     fill(stage)
     batch = stage.buffer.sample()
-    best = stage._best(batch)["action"]
+    best = found.shown(batch)["action"]
     reward = batch["next", "reward"].squeeze(-1)
     threshold = reward.sort(descending=True).values[7]
     assert best.shape[0] == 8
-    allowed = batch["shown_action"][reward >= threshold]
-    assert all((row == allowed).all(-1).any() for row in best)
+    allowed = batch["loc"].tanh()[reward >= threshold]
+    assert all(torch.isclose(row, allowed).all(-1).any() for row in best)
     stage.close()
 
 
@@ -152,12 +163,14 @@ def test_pairs_in_the_buffer_are_the_executed_ones_while_the_decoder_changes():
     for _ in range(3):
         batch = stage.collect()
         with torch.no_grad():
-            expected.append(stage.decoder.module(batch["synergy"]))
-            for parameter in stage.decoder.parameters():
+            expected.append(stage.learner.decoder.module(batch["synergy"]))
+            for parameter in stage.learner.decoder.parameters():
                 parameter.add_(0.05)  # the next batch must be decoded with these
     kept = stage.buffer.storage[:]
     torch.testing.assert_close(kept["action"], torch.cat(expected))
-    assert not torch.allclose(kept["action"], stage.decoder.module(kept["synergy"]), atol=1e-3)
+    assert not torch.allclose(
+        kept["action"], stage.learner.decoder.module(kept["synergy"]), atol=1e-3
+    )
     stage.close()
 
 
@@ -165,48 +178,50 @@ def test_pairs_in_the_buffer_are_the_executed_ones_while_the_decoder_changes():
     ("fine_tuning", "learns"), [("critic", True), ("reconstruction", True), ("frozen", False)]
 )
 def test_decoder_learns_only_in_the_modes_that_say_so(fine_tuning, learns):
-    stage = learn_stage(None, f"learn.fine_tuning={fine_tuning}", "learn.decoder_lr=1e-2")
+    stage = learn_stage(None, f"learn.decoder.fine_tuning={fine_tuning}", "learn.decoder.lr=1e-2")
     fill(stage)
     if fine_tuning == "reconstruction":  # on fresh pairs Eq. 10 has no gradient at all
         with torch.no_grad():
-            stage.decoder.module.decoder.mlp[-1].bias.add_(0.1)
-    before, policy = snapshot(stage.decoder), snapshot(stage.policy)
+            stage.learner.decoder.module.decoder.mlp[-1].bias.add_(0.1)
+    before, policy = snapshot(stage.learner.decoder), snapshot(stage.learner.behavior)
     stage.update()
-    assert changed(stage.decoder, before) is learns
-    assert changed(stage.policy, policy)
+    assert changed(stage.learner.decoder, before) is learns
+    assert changed(stage.learner.behavior, policy)
     stage.close()
 
 
 def test_eq_10_is_self_distillation_on_fresh_pairs():
-    stage = learn_stage(None, "learn.fine_tuning=reconstruction", "learn.decoder_lr=1e-2")
+    stage = learn_stage(None, "learn.decoder.fine_tuning=reconstruction", "learn.decoder.lr=1e-2")
     fill(stage)
-    before = snapshot(stage.decoder)
+    before = snapshot(stage.learner.decoder)
     assert stage.update()["loss_decoder"] < 1e-10
-    after = stage.decoder.state_dict()
+    after = stage.learner.decoder.state_dict()
     assert all(torch.allclose(after[key], before[key], atol=1e-4) for key in before)
     stage.close()
 
 
 def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
-    first = explore_stage()
+    found = explorer()
+    first = found.stage
     fill(first)
     for _ in range(3):
         first.update()
-    decoder = first.finish()
-    before = copy.deepcopy([snapshot(first.encoder), snapshot(first.gmvae)])
-    second = learn_stage(decoder, "learn.decoder_lr=1e-2")
+    decoder = found.condense()
+    before = copy.deepcopy([snapshot(found.exploration.encoder), snapshot(found.model.model)])
+    second = learn_stage(decoder, "learn.decoder.lr=1e-2")
     fill(second)
-    tuned = snapshot(second.decoder)
+    tuned = snapshot(second.learner.decoder)
     for _ in range(5):
         second.update()
-    assert not changed(first.encoder, before[0])
-    assert not changed(first.gmvae, before[1])
-    assert changed(second.decoder, tuned)
+    assert not changed(found.exploration.encoder, before[0])
+    assert not changed(found.model.model, before[1])
+    assert changed(second.learner.decoder, tuned)
     first.close(), second.close()
 
 
 def test_updates_keep_the_ratio_that_was_asked_for():
-    stage = explore_stage("explore.updates_per_frame=0.1", "explore.learning_starts=0")
+    found = explorer("explore.replay_ratio=0.1", "explore.learning_starts=0")
+    stage = found.stage
     for _ in range(5):
         stage.collect()
         stage.learn()
@@ -221,12 +236,12 @@ def test_frames_are_steps_of_the_simulator_however_long_an_action_lasts(tmp_path
             f"run_dir={tmp_path}/run",
             "action_repeat=2",
             "explore.frames=256",
-            "explore.updates_per_frame=0.25",
+            "explore.replay_ratio=0.25",
             "explore.learning_starts=0",
             "learn.frames=128",
         )
     )
-    stage = run.explore_stage()
+    stage = Explorer(run.context).stage
     stage.restart_collection()
     stage.collect(), stage.learn()  # 32 actions
     assert stage.frames == 64 and len(stage.buffer) == 32 and stage.progress.updates == 16
@@ -239,14 +254,16 @@ def test_frames_are_steps_of_the_simulator_however_long_an_action_lasts(tmp_path
 
 
 def test_gaussian_divergence_trains_its_latent_dynamics():
-    stage = explore_stage("explore.metric.divergence=gaussian")
+    found = explorer("exploration.metric.divergence=gaussian")
+    stage = found.stage
     fill(stage)
     assert "loss_dynamics" in stage.update().keys()
     stage.close()
 
 
 def test_restarting_collection_lets_the_old_simulators_go():
-    stage = explore_stage()
+    found = explorer()
+    stage = found.stage
 
     def simulators():
         return sum(type(thing) is AnalyticOveractuated for thing in gc.get_objects())
@@ -262,7 +279,8 @@ def test_restarting_collection_lets_the_old_simulators_go():
 
 
 def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
-    stage = explore_stage("explore.buffer_size=100")
+    found = explorer("explore.buffer_size=100")
+    stage = found.stage
     for _ in range(5):
         batch = stage.collect()
     assert torch.equal(stage.newest(32)["action"], batch["action"])
@@ -270,18 +288,17 @@ def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("learner", ["plain", "residual"])
+@pytest.mark.parametrize("learner", [(), RESIDUAL], ids=["plain", "residual"])
 def test_a_compiled_update_is_the_same_update(learner):
-    settings = (f"learner={learner}", "actor.hidden=[16,16]", "critic.hidden=[16,16]")
+    settings = (*learner, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])
     batch = stages[0].buffer.sample()
-    stages[1].return_scale, stages[1].norm = stages[0].return_scale, stages[0].norm
-    stages[1].sac.load_state_dict(stages[0].sac.state_dict())
+    stages[1].learner.objective.load_state_dict(stages[0].learner.objective.state_dict())
     outs = []
     for stage in stages:
         torch.manual_seed(0)
-        outs.append((*stage._gradients(batch.clone()),))
+        outs.append((*stage.learner._gradients(batch.clone()),))
         stage.close()
     (eager, logged), (compiled, logged_too) = outs
     for one, two in zip(eager, compiled, strict=True):
@@ -293,12 +310,14 @@ def test_a_compiled_update_is_the_same_update(learner):
 @pytest.mark.gpu
 @pytest.mark.slow
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-@pytest.mark.parametrize("make", [explore_stage, lambda *args: learn_stage(None, *args)])
+@pytest.mark.parametrize(
+    "make", [lambda *args: explorer(*args).stage, lambda *args: learn_stage(None, *args)]
+)
 def test_updates_learn_from_a_cuda_graph(make):
     stage = make("compile=true", "device=cuda")
     fill(stage)
-    before = snapshot(stage.policy)
+    before = snapshot(stage.learner.behavior)
     for _ in range(20):  # warm-up, capture, replay
         assert all(value.isfinite() for value in stage.update().values())
-    assert changed(stage.policy, before)
+    assert changed(stage.learner.behavior, before)
     stage.close()

@@ -29,7 +29,13 @@ class MetricExploration(DirectionExploration):
     """
 
     def __init__(
-        self, observation_dim: int, *, lr: float, tau: float, metric: dict[str, Any], **directions: Any
+        self,
+        observation_dim: int,
+        *,
+        lr: float,
+        tau: float,
+        metric: dict[str, Any],
+        **directions: Any,
     ) -> None:
         super().__init__(observation_dim, **directions)
         self._lr, self._tau, self._metric = lr, tau, dict(metric)

@@ -81,7 +81,6 @@ class Explorer:
         )
         self.seed = self.stage.seed
 
-
     def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
         """Train the synergy model to the end; returns the decoder for stage 2.
 

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
-from torchrl_etl.functional import reconstruction_loss
 from torchrl_etl.checks import check_choice
+from torchrl_etl.functional import reconstruction_loss
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["DecoderLoss"]

@@ -12,8 +12,8 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.modules import GMVAE
 from torchrl_etl.checks import check_choice
+from torchrl_etl.modules import GMVAE
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["GMVAELoss"]

@@ -125,7 +125,9 @@ class Stage:
         self._most_updates = math.ceil(2 * replay_ratio * action_repeat * per_batch)
         room = min(buffer_size, prefill_size + frames // action_repeat + per_batch)
         self.buffer = TensorDictReplayBuffer(
-            storage=make_storage(room, device, scratch / name if buffer_storage == "memmap" else None),
+            storage=make_storage(
+                room, device, scratch / name if buffer_storage == "memmap" else None
+            ),
             batch_size=batch_size,
         )
         self.transforms = nn.ModuleList(transforms)
