@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, get_args
 
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_choice, check_flag
 from torchrl_etl.learners.objective import NORMALIZED
 from torchrl_etl.learners.sac import SACLearner, entropy_target
-from torchrl_etl.modules import HeldNoise, RunningNorm, SynergyMap, make_actor, make_critic
+from torchrl_etl.modules import (
+    HeldNoise,
+    RunningNorm,
+    SynergyMap,
+    UniformWarmup,
+    make_actor,
+    make_critic,
+)
 
 __all__ = ["Noise", "build_learner"]
 
@@ -27,10 +39,12 @@ def build_learner(
     critic: Mapping[str, Any],
     sac: Mapping[str, Any],
     noise: Mapping[str, Any],
+    init_random_actions: int = 0,
     decoder: SynergyMap | None = None,
     inputs: Mapping[str, int] | None = None,
     make_actor: Callable[..., Actor] = make_actor,
     make_behavior: Callable[[Actor], TensorDictModuleBase] | None = None,
+    wrap: Callable[[TensorDictModuleBase], TensorDictModuleBase] = lambda behavior: behavior,
     entropy: Callable[[Bounded, float | None], float | Literal["auto"]] = entropy_target,
     more: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
 ) -> SACLearner:
@@ -50,11 +64,14 @@ def build_learner(
             :class:`~torchrl_etl.modules.RunningNorm` makes of observations).
         noise (mapping): of exploration: ``kind``, ``"independent"`` at every step or ``"held"``
             for several, and keyword arguments of :class:`~torchrl_etl.modules.HeldNoise`.
+        init_random_actions (int): actions of each worker that are uniform within the bounds of
+            what the actor emits, before the policy's. Default: 0.
         decoder (SynergyMap, optional): the actor emits what it reads. Default: an action.
         inputs (mapping, optional): sizes of what the networks read beside the observation, by key.
         make_actor (callable): builds the actor. Default: :func:`~torchrl_etl.modules.make_actor`.
         make_behavior (callable, optional): makes the policy that collects of the actor; ``noise``
             is then not read.
+        wrap (callable): puts something around the policy that collects, its noise included.
         entropy (callable): target entropy of the bounds and ``action_std``.
         more (callable): further arguments of the learner, made for the actor.
 
@@ -76,6 +93,11 @@ def build_learner(
         behavior = HeldNoise(policy, **noise) if kind == "held" else policy
     else:
         behavior = make_behavior(policy)
+    behavior, options = wrap(behavior), dict(more(policy))
+    if init_random_actions:
+        warmup = UniformWarmup(emitted, init_random_actions, action_key=out_key)
+        behavior = TensorDictSequential(behavior, warmup)
+        options["on_restart"] = [*options.get("on_restart", ()), partial(setattr, warmup, "seen")]
     return SACLearner(
         policy,
         value,
@@ -86,5 +108,5 @@ def build_learner(
         target_entropy=entropy(emitted, sac.pop("action_std")),
         bins=critic.get("bins", 1),
         **sac,
-        **more(policy),
+        **options,
     )

@@ -61,8 +61,9 @@ class SACLearner:
         return_bound (float, optional): rewards are scaled so that returns stay within it.
         bins (int): above 1, critics are categorical with so many returns in ±``return_bound``.
         unit_rows (bool): rows of all linear layers keep unit length. Default: ``False``.
-        on_frames, on_restart (callable, optional): told the number of frames, after each batch and
-            where new episodes begin.
+        on_frames (sequence of callable): told the number of frames after each batch.
+        on_restart (sequence of callable): told, where new episodes begin, how many actions each
+            worker has taken; parts of the behavior policy that count actions go on from there.
         compile (bool): compile updates; on CUDA they also become one CUDA graph.
 
     Raises:
@@ -105,8 +106,8 @@ class SACLearner:
         return_bound: float | None = None,
         bins: int = 1,
         unit_rows: bool = False,
-        on_frames: Callable[[int], None] | None = None,
-        on_restart: Callable[[int], None] | None = None,
+        on_frames: Sequence[Callable[[int], None]] = (),
+        on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
     ) -> None:
         self.gamma, self.lr_end, self.device = gamma, lr_end, next(actor.parameters()).device
@@ -184,12 +185,12 @@ class SACLearner:
         if self.objective.normalizer is not None:
             self.objective.normalizer.see(batch["observation"])
 
-    def restart(self, frames: int) -> None:
-        """All episodes begin anew after so many frames."""
+    def restart(self, actions: int) -> None:
+        """All episodes begin anew, when each worker has taken so many actions."""
         if self.objective.return_scale is not None:
             self.objective.return_scale.forget()
-        if self.on_restart is not None:
-            self.on_restart(frames)
+        for tell in self.on_restart:
+            tell(actions)
 
     def advance(self, frames: int, progress: float) -> None:
         """Set what depends on the number of frames, and on the share of all frames that it is."""
@@ -199,8 +200,8 @@ class SACLearner:
                 group["lr"].fill_(factor * rate)
             else:
                 group["lr"] = factor * rate
-        if self.on_frames is not None:
-            self.on_frames(frames)
+        for tell in self.on_frames:
+            tell(frames)
 
     @property
     def parts(self) -> dict[str, Any]:

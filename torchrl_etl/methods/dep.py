@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.baselines import DEPExploration
@@ -12,30 +14,36 @@ __all__ = ["DEP"]
 
 
 class DEP(Method):
-    """SAC whose behavior policy is followed by DEP's controller.
+    """SAC whose actor is followed by DEP's controller.
+
+    Learning starts when DEP has acted alone, as in the public code.
 
     Deviates: its authors' learner is MPO; here it is SAC, the same as everyone's.
 
-    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`.
+    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, but ``dep_frames``
+    counts frames of the run, those of all workers.
     """
 
-    env_options = {"muscle_lengths": True}  # noqa: RUF012
+    takes = ("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau")
+    takes += ("bias_rate", "time_distance", "s4avg", "normalize")
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")
-        repeat = self.context.config.action_repeat
-        controller = DEPExploration(self.context.spec.action_spec, **self.options)
-
-        def restart(frames: int) -> None:
-            # A resumed run goes on where it was; the controller counts its actions.
-            controller.frames = frames // repeat
-
-        learner = self.context.learner(
-            make_behavior=lambda actor: TensorDictSequential(actor, controller),
-            more=lambda actor: {"on_restart": restart},
+        alone = self.options["dep_frames"]
+        controller = DEPExploration(
+            self.context.spec.action_spec,
+            **{**self.options, "dep_frames": self.context.actions(alone)},
         )
-        return self.context.stage(learner, env_options=self.env_options)
+        learner = self.context.learner(
+            wrap=lambda behavior: TensorDictSequential(behavior, controller),
+            more=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
+        )
+        return self.context.stage(
+            learner,
+            env_options={"muscle_lengths": True},
+            learning_starts=max(alone, self.context.config.learn.learning_starts),
+        )
 
     def check(self) -> None:
         super().check()
-        self.context.make_env(**self.env_options).close()
+        self.context.make_env(muscle_lengths=True).close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 from torchrl.data import Bounded
@@ -29,15 +30,20 @@ class DynSyn(Method):
     Its actor's distribution is its own: ``learn.noise`` is not read.
 
     Options: ``frames`` of the recording, which are charged, ``amplitude`` of joint velocities in
-    it, ``group_share``, groups per muscle, and keyword arguments of
-    :func:`~torchrl_etl.baselines.make_dynsyn_actor`.
+    it and ``group_share``, groups per muscle (one number, or one for ``legs`` and one for
+    ``hands``), and keyword arguments of :func:`~torchrl_etl.baselines.make_dynsyn_actor`; with
+    ``start_share`` in place of ``start`` and ``slope``, weights deviate from that share of the
+    stage's frames on, linearly up to their ceiling at the last frame.
     """
+
+    takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         options = dict(self.options)
         self.charged = options.pop("frames")
-        self.amplitude, self.share = options.pop("amplitude"), options.pop("group_share")
+        self.amplitude = self.of_the_body(options.pop("amplitude"))
+        self.share = self.of_the_body(options.pop("group_share"))
         self.actor_options = options
         self.file = context.folder.path / "muscle_groups.json"
 
@@ -61,10 +67,14 @@ class DynSyn(Method):
         return list(range(len(self.context.spec.actuators)))  # a placeholder
 
     def stage(self) -> Stage:
-        groups = self.groups
+        groups, deviation = self.groups, dict(self.actor_options)
+        if "start_share" in deviation:
+            frames = self.context.config.learn.frames
+            start = deviation.pop("start_share") * frames
+            deviation |= {"start": start, "slope": deviation["ceiling"] / (frames - start)}
 
         def make_actor(inputs, spec, **options):
-            return make_dynsyn_actor(inputs, spec, groups, **options, **self.actor_options)
+            return make_dynsyn_actor(inputs, spec, groups, **options, **deviation)
 
         def entropy(spec: Bounded, action_std: float | None) -> float:
             # The actor's log-probability counts one dimension a group.
@@ -78,6 +88,6 @@ class DynSyn(Method):
             make_actor=make_actor,
             make_behavior=lambda actor: actor,
             entropy=entropy,
-            more=lambda actor: {"on_frames": lambda frames: set_frames(actor, frames)},
+            more=lambda actor: {"on_frames": [partial(set_frames, actor)]},
         )
         return self.context.stage(learner)

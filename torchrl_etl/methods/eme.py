@@ -16,11 +16,16 @@ class EME(Method):
 
     Bonus and metric are of single steps: ``learn.n_steps`` is not read.
 
+    Its metric has the discount of the learner.
+
     Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
 
     Options: ``embedding_dim`` and ``hidden`` of the encoder, ``ensemble`` (its size), ``lr``,
-    ``tau`` (EMA rate of the target encoder), ``weight`` and ``max_scale`` of the bonus.
+    ``tau`` (EMA rate of the target encoder), ``weight``, ``normalize`` and ``max_scale`` of
+    :class:`~torchrl_etl.baselines.EMEBonus`.
     """
+
+    takes = ("embedding_dim", "hidden", "ensemble", "lr", "tau", "weight", "normalize", "max_scale")
 
     def stage(self) -> Stage:
         spec, options = self.context.spec, self.options
@@ -31,11 +36,11 @@ class EME(Method):
         encoder, ensemble = encoder.to(device), ensemble.to(device)
 
         def more(actor):
-            loss = EMELoss(encoder, ensemble, actor).to(device)
+            gamma = self.context.config.learn.sac.gamma
+            loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
             term = Term(loss, lr=options["lr"], tau=options["tau"])
             return {"terms": [term], "reward": "total_reward"}
 
-        bonus = EMEBonus(
-            encoder, ensemble, weight=options["weight"], max_scale=options["max_scale"]
-        )
+        scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
+        bonus = EMEBonus(encoder, ensemble, **scale)
         return self.context.stage(self.context.learner(more=more), transforms=[bonus], n_steps=1)

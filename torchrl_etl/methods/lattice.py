@@ -18,6 +18,8 @@ class Lattice(Method):
     and keyword arguments of :func:`~torchrl_etl.baselines.make_lattice_actor`.
     """
 
+    takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
+
     def stage(self) -> Stage:
         options = dict(self.options)
         freq, held = options.pop("freq"), options["state_dependent"]

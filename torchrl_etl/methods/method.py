@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+from torchrl_etl.envs import has_free_root
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.stage import Stage
@@ -21,6 +22,7 @@ class Method:
     Attributes:
         charged (int): frames that :meth:`prepare` takes; they count.
         has_synergies (bool): whether ``stage`` and ``synergies`` may be given.
+        takes (tuple of str): names of its own options.
 
     Raises:
         ValueError: for options that it does not have, or that cannot be used.
@@ -28,12 +30,20 @@ class Method:
 
     charged: int = 0
     has_synergies: ClassVar[bool] = False
+    takes: ClassVar[tuple[str, ...]] = ()
     options: Mapping[str, Any]
 
     def __init__(self, context: Context) -> None:
         self.context = context
         self.options = context.options("method").get("options") or {}
         config = context.config
+        for name in self.options:
+            if name not in self.takes:
+                raise ValueError(
+                    f"method.options.{name} is none of the options of method={config.method.name} "
+                    f"({', '.join(self.takes) or 'it has none'}); settings of the learner, such as "
+                    "the discount, are those of learn, such as learn.sac.gamma."
+                )
         if not self.has_synergies and (config.stage != "all" or config.synergies.bundle):
             raise ValueError(
                 f"method={config.method.name} has one stage and no synergies; leave stage and "
@@ -63,3 +73,12 @@ class Method:
     def check(self) -> None:
         """Build every part once, so that each objects to its arguments before the first frame."""
         self.stage()
+
+    def of_the_body(self, option: float | Mapping[str, float]) -> float:
+        """An option as given, or the one for this body of the two for ``legs`` and for ``hands``.
+
+        Legs are what stands free: a body whose root floats.
+        """
+        if not isinstance(option, Mapping):
+            return option
+        return option["legs" if has_free_root(self.context.make_env()) else "hands"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,9 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_etl.baselines import SARDecoder, best_episodes
-from torchrl_etl.envs import episode_length
+from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
+from torchrl_etl.learners.sac import episode_numbers
 from torchrl_etl.methods.method import Method
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.training.context import Context
@@ -23,64 +25,86 @@ __all__ = ["SAR"]
 
 
 class SAR(Method):
-    """Plays with plain SAC and takes synergies from the muscles of the best episodes."""
+    """Plays with plain SAC and takes synergies from the muscles of the best of fresh episodes.
+
+    Deviates: the frames of the rollouts are charged too, so they are few; the first of them,
+    half at most, are the preview of whose returns the percentile is taken.
+
+    Options: ``play_task`` (another task of the same body), ``frames`` of play and
+    ``rollout_frames`` after it, ``preview_episodes`` and ``percentile`` of their returns,
+    ``num_synergies`` and ``blend`` of :class:`~torchrl_etl.baselines.SARDecoder`.
+    """
+
+    takes = ("play_task", "frames", "rollout_frames", "preview_episodes", "percentile")
+    takes += ("num_synergies", "blend")
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        self.charged, self.percentile = self.options["frames"], self.options["percentile"]
-        self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
-        self.file = context.folder.path / "sar.safetensors"
         config = context.config
-        steps = episode_length(config.env, config.goal) or 0
-        self.one_episode_each = steps * config.collector.num_envs
-        if self.charged < self.one_episode_each:
+        self.rollout_frames, self.task = self.options["rollout_frames"], self.options["play_task"]
+        self.charged = self.options["frames"] + self.rollout_frames
+        self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
+        self.blend = self.of_the_body(self.options["blend"])
+        self.file = context.folder.path / "sar.safetensors"
+        self.play_spec = context.spec
+        if self.task is not None:
+            env = make_env(self.task, action_repeat=config.action_repeat)
+            self.play_spec = EnvironmentSpec.of(env, context.device)
+            if self.play_spec.actuators != context.spec.actuators:
+                raise ValueError(
+                    f"method.options.play_task is {self.task}, whose actuators are not those of "
+                    f"{config.env}; play on a task of the same body."
+                )
+        name, goal = (self.task, None) if self.task else (config.env, config.goal)
+        steps, simulators = episode_length(name, goal) or 0, config.collector.num_envs
+        if self.rollout_frames < (needed := steps * max(2, simulators)):
             raise ValueError(
-                f"method.options.frames is {self.charged}, but {config.collector.num_envs} "
-                f"simulators need {self.one_episode_each} for an episode of {steps} steps each, "
-                "and SAR takes the best of whole episodes; give more."
+                f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "
+                f"simulators need {needed} for two whole episodes of {steps} steps, and SAR takes "
+                "the best of whole episodes; give more."
             )
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
         if not self.file.is_file():
-            play = self.play()
-            # Episodes begin anew after each checkpoint; some have to come to their end.
-            every = max(self.context.config.checkpoint.every, 2 * self.one_episode_each)
-            self.context.run_stage(play, stop, checkpoint_every=every)
-            found = finished_episodes(play.newest(self.charged))
-            actions = best_episodes(**found, percentile=self.percentile)
-            write_atomically(self.file, save(self.fit(actions).state_dict()))
+            play = self.play_stage()
+            self.context.run_stage(play, stop)
+            decoder = self.fit(self.best(rollouts(play, self.rollout_frames, stop.check)))
+            write_atomically(self.file, save(decoder.state_dict()))
         return {}
 
-    def play(self) -> Stage:
-        """SAC on the task that remembers which muscle activations came of it, by episode."""
+    def play_stage(self) -> Stage:
+        """The stage whose policy plays, before its first frame."""
         self.context.seed_everything("learn")
-        keep = ("activation", "episode_reward")
         return self.context.stage(
-            self.context.learner(),
+            self.context.learner(spec=self.play_spec),
+            task=self.task,
             env_options={"activations": True},
             name="play",
-            frames=self.charged,
-            n_steps=1,
-            keep=(("collector", "traj_ids"), *(("next", key) for key in keep)),
+            frames=self.options["frames"],
+        )
+
+    def best(self, rows: TensorDictBase) -> Tensor:
+        """Activations of the episodes above the percentile of the preview, the first of them."""
+        found = finished_episodes(rows)
+        numbers = found["episodes"].unique()
+        preview = numbers[: min(self.options["preview_episodes"], len(numbers) // 2)]
+        returns = [found["returns"][found["episodes"] == number][:1] for number in preview]
+        fresh = ~torch.isin(found["episodes"], preview)
+        return best_episodes(
+            **{key: value[fresh] for key, value in found.items()},
+            percentile=self.options["percentile"],
+            preview=torch.cat(returns) if returns else None,
         )
 
     def fit(self, actions: Tensor) -> SARDecoder:
-        spec = self.context.spec
-        return SARDecoder.fit(
-            actions,
-            self.num_synergies,
-            low=spec.low,
-            high=spec.high,
-            blend=self.options["blend"],
-            seed=self.context.config.seed,
-        )
+        spec, seed = self.context.spec, self.context.config.seed
+        bounds = {"low": spec.low, "high": spec.high}
+        return SARDecoder.fit(actions, self.num_synergies, **bounds, blend=self.blend, seed=seed)
 
     def stage(self) -> Stage:
         spec = self.context.spec
         blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
-        decoder = SARDecoder(
-            blank[0], blank[1:], low=spec.low, high=spec.high, blend=self.options["blend"]
-        )
+        decoder = SARDecoder(blank[0], blank[1:], low=spec.low, high=spec.high, blend=self.blend)
         if self.file.is_file():
             decoder.load_state_dict(load_file(self.file))
         self.context.seed_everything("learn")
@@ -91,15 +115,37 @@ class SAR(Method):
         return self.context.stage(learner, keep=("synergy",))
 
 
+def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> TensorDictBase:
+    """Steps [N] of new episodes of a stage's policy, acting as it explores, without learning.
+
+    Args:
+        stage (Stage): whose learner acts; it is closed.
+        frames (int): at least so many are collected.
+        check (callable): called before each batch; it may raise.
+    """
+    torch.manual_seed(stage.seed)  # the same whether or not the run was resumed
+    kept = [("next", key) for key in ("activation", "episode_reward", "done")]
+    rows: list[TensorDictBase] = []
+    try:
+        stage.restart_collection()
+        while stage.action_repeat * sum(map(len, rows)) < frames:
+            check()
+            batch = stage.batches.next().to(stage.device)
+            rows.append(batch.select(*kept).set("episode", episode_numbers(batch)).reshape(-1))
+    finally:
+        stage.close()
+    return torch.cat(rows)
+
+
 def finished_episodes(rows: TensorDictBase) -> dict[str, Tensor]:
     """Activations [N, n], returns [N] and episodes [N] of the steps of whole episodes."""
-    episodes = rows["collector", "traj_ids"].reshape(-1)
+    numbers, episode = rows["episode"].unique(return_inverse=True)
     ends = rows["next", "done"].reshape(-1)
-    returns = torch.full((int(episodes.max()) + 1,), torch.nan)
-    returns[episodes[ends]] = rows["next", "episode_reward"].reshape(-1)[ends]
-    whole = returns[episodes].isfinite()
+    returns = torch.full(numbers.shape, torch.nan)
+    returns[episode[ends]] = rows["next", "episode_reward"].reshape(-1)[ends]
+    whole = returns[episode].isfinite()
     return {
         "actions": rows["next", "activation"][whole],
-        "returns": returns[episodes][whole],
-        "episodes": episodes[whole],
+        "returns": returns[episode][whole],
+        "episodes": episode[whole],
     }

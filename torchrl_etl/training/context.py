@@ -14,14 +14,18 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from torchrl_etl.checks import check_integer
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.learners import SACLearner, build_learner
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
-from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.stage import Stage, frames_per_action
 
 __all__ = ["Context", "naming"]
+
+NOT_OF_THE_STAGE = ("actor", "critic", "sac", "noise", "init_random_frames")  # the learner's
+NOT_OF_THE_STAGE += ("decoder", "prefill", "fit")  # the method's
 
 
 @dataclass(frozen=True)
@@ -56,17 +60,32 @@ class Context:
         variant = {"goal": self.config.goal, "action_repeat": self.config.action_repeat}
         return make_env(self.config.env, device=self.device, **{**variant, **options})
 
-    def learner(self, section: str = "learn", **parts: Any) -> SACLearner:
-        """The learner that ``section`` configures; for ``parts`` see ``build_learner``."""
+    def learner(
+        self, section: str = "learn", *, spec: EnvironmentSpec | None = None, **parts: Any
+    ) -> SACLearner:
+        """The learner that ``section`` configures.
+
+        Args:
+            section (str): ``"explore"`` or ``"learn"``.
+
+        Keyword Args:
+            spec (EnvironmentSpec, optional): of another environment than the run's.
+            **parts: see :func:`~torchrl_etl.learners.build_learner`.
+        """
+        spec = spec or self.spec
         options = self.options(section)
         configured = {key: options[key] for key in ("actor", "critic", "sac", "noise")}
         compile = self.config.compile
         if compile is None:  # what it takes to begin must pay
             compile = options["frames"] * options["replay_ratio"] >= 10_000
         configured["sac"]["compile"] = compile
+        random = options.get("init_random_frames", 0)
+        with naming(section):
+            check_integer(0, init_random_frames=random)
+        configured["init_random_actions"] = self.actions(random)
         with naming(section):
             return build_learner(
-                self.spec.observation_dim, self.spec.action_spec, **{**configured, **parts}
+                spec.observation_dim, spec.action_spec, **{**configured, **parts}
             )
 
     def stage(
@@ -74,6 +93,7 @@ class Context:
         learner: SACLearner,
         section: str = "learn",
         *,
+        task: str | None = None,
         env_options: dict[str, bool] | None = None,
         env_transforms: Sequence[Transform] = (),
         **options: Any,
@@ -85,6 +105,7 @@ class Context:
             section (str): ``"explore"`` or ``"learn"``.
 
         Keyword Args:
+            task (str, optional): another task than the run's, with the goal that its name says.
             env_options (dict): what the environment must also give, see
                 :func:`~torchrl_etl.envs.make_env`.
             env_transforms (sequence of Transform): appended to it.
@@ -96,16 +117,16 @@ class Context:
         collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
         make_env = partial(
             env_of_a_collector,
-            self.config.env,
-            goal=self.config.goal,
+            task or self.config.env,
+            goal=None if task else self.config.goal,
             action_repeat=self.config.action_repeat,
             num_envs=num_envs,
             transforms=tuple(env_transforms),
             **env_options or {},
         )
         configured = self.options(section)
-        for of_others in ("actor", "critic", "sac", "noise", "decoder", "prefill", "fit"):
-            configured.pop(of_others, None)
+        for key in NOT_OF_THE_STAGE:
+            configured.pop(key, None)
         fixed = {
             "name": section,
             "seed": stage_seed(self.config.seed, section),
@@ -116,6 +137,10 @@ class Context:
         }
         with naming(section):
             return Stage(learner=learner, make_env=make_env, **{**configured, **fixed, **options})
+
+    def actions(self, frames: int) -> int:
+        """Actions of each worker, all its simulators counted, in so many frames of the run."""
+        return frames // frames_per_action(self.options("collector"), self.config.action_repeat)
 
     def run_stage(self, stage: Stage, stop: StopOnSignal, **options: Any) -> Any:
         """Run a stage to its end, see :func:`~torchrl_etl.training.loop.run_stage`."""

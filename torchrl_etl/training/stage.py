@@ -122,6 +122,7 @@ class Stage:
             make_batches, **collector, make_env=make_env, policy=learner.behavior, device=device
         )
         per_batch = collector["frames_per_batch"]
+        self._frames_per_action = frames_per_action(collector, action_repeat)
         self._most_updates = math.ceil(2 * replay_ratio * action_repeat * per_batch)
         room = min(buffer_size, prefill_size + frames // action_repeat + per_batch)
         self.buffer = TensorDictReplayBuffer(
@@ -216,7 +217,7 @@ class Stage:
         A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
-        self.learner.restart(self.frames)
+        self.learner.restart(self.frames // self._frames_per_action)
         if self.multi_step is not None:
             self.multi_step.forget()
         seed = training_seed(self.seed, self.frames)
@@ -250,3 +251,13 @@ def make_storage(size: int, device: torch.device, scratch: Path | None) -> Stora
         return LazyTensorStorage(size, device=device)
     # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
     return LazyMemmapStorage(size, scratch_dir=scratch, existsok=True)
+
+
+def frames_per_action(collector: Mapping[str, Any], action_repeat: int) -> int:
+    """Frames of a run for each action of one of its workers.
+
+    Examples:
+        >>> frames_per_action({"kind": "process", "num_workers": 4}, action_repeat=2)
+        8
+    """
+    return action_repeat * (1 if collector["kind"] == "single" else collector["num_workers"])
