@@ -46,9 +46,10 @@ def measure(arguments: argparse.Namespace, folder: str) -> None:
         f"learn.frames={arguments.transitions}",
     ]
     experiment = Experiment(recipe(*overrides))
-    stage = experiment.learn_stage(experiment.blank_decoder())
+    stage = experiment.method.stage()
     stage.restart_collection()
-    rows = stage.transitions(stage.collect())
+    stage.collect()
+    rows = stage.newest(len(stage.buffer)).clone()
     copies = rows.expand(100, *rows.shape).reshape(-1)
     while len(stage.buffer) < arguments.transitions:
         stage.buffer.extend(copies)

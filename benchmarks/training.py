@@ -13,13 +13,14 @@ from harness import recipe
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.training.stage import Stage
+from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.training import Stage
 
 
 def build(experiment: Experiment, method: str) -> Stage:
     if method == "etl_explore":
-        return experiment.explore_stage()
-    return experiment.learn_stage(experiment.blank_decoder() if method == "etl_learn" else None)
+        return Explorer(experiment.context).stage
+    return experiment.method.stage()
 
 
 def main() -> None:
@@ -35,11 +36,12 @@ def main() -> None:
         f"env={arguments.env}",
         "run_dir=unused",
         "actor.layer_norm=false",
-        f"explore.updates_per_frame={updates}",
-        f"learn.updates_per_frame={updates}",
+        f"explore.replay_ratio={updates}",
+        f"learn.replay_ratio={updates}",
         *arguments.overrides,
     ]
-    experiment = Experiment(recipe(*overrides))
+    method = "sac" if arguments.method == "sac" else "etl"
+    experiment = Experiment(recipe(*overrides, f"method={method}"))
     stage = build(experiment, arguments.method)
     stage.restart_collection()
 

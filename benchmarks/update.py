@@ -36,15 +36,14 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.learners import SACLearner
+from torchrl_etl.methods.etl import Explorer
 from torchrl_etl.modules import make_actor, make_critic
-from torchrl_etl.objectives import LeanSACLoss
-from torchrl_etl.training.stage import Stage, make_optimizer, ready_for_training
+from torchrl_etl.training import Stage
 
 ROOT = Path(__file__).parent.parent
 PEER = ROOT / ".venv-peers" / "bin" / "python"
 TRANSITIONS = 4096
-CPU = torch.device("cpu")
 Shape = tuple[int, int, int]
 
 
@@ -57,11 +56,10 @@ def config(env: str, compile: bool, layer_norm: bool) -> Any:
 def stages(env: str, compile: bool, layer_norm: bool) -> tuple[Stage, Stage]:
     """Both stages as the recipe builds them, their buffers filled."""
     experiment = Experiment(config(env, compile, layer_norm))
-    decoder = experiment.blank_decoder()
-    both = experiment.explore_stage(), experiment.learn_stage(decoder)
-    sizes = experiment.spec.observation_spec["observation"].shape[-1], decoder.action_dim
+    both = Explorer(experiment.context).stage, experiment.method.stage()
+    spec, d = experiment.context.spec, experiment.config.num_synergies
     for stage in both:
-        stage.buffer.extend(transitions(*sizes, decoder.num_synergies))
+        stage.buffer.extend(transitions(spec.observation_dim, spec.action_dim, d))
     return both
 
 
@@ -74,7 +72,6 @@ def transitions(observation_dim: int, action_dim: int, num_synergies: int) -> Te
             "observation": torch.randn(TRANSITIONS, observation_dim),
             "direction": direction,
             "action": torch.rand(TRANSITIONS, action_dim),
-            "shown_action": torch.rand(TRANSITIONS, action_dim),
             "synergy": 2 * torch.rand(TRANSITIONS, num_synergies) - 1,
             "next": {
                 "observation": torch.randn(TRANSITIONS, observation_dim),
@@ -120,13 +117,13 @@ def sac_products(batch: int, inputs: int, action: int, out: int, hidden: list[in
 
 def stage_products(cfg: Any, name: str, observation_dim: int, action_dim: int) -> list[Shape]:
     d, batch, hidden = cfg.num_synergies, cfg[name].batch_size, list(cfg.actor.hidden)
-    body = list(cfg.explore.gmvae.hidden)
+    body = list(cfg.synergies.hidden)
     decoder = [d, *reversed(body), action_dim]
     if name == "learn":
         shapes = sac_products(batch, observation_dim, action_dim, d, hidden)
         return shapes + list(products(batch, decoder, "ffwifwh"))  # s', s, Eq. 10
     shapes = sac_products(batch, observation_dim + d, action_dim, action_dim, hidden)
-    shapes += products(batch, [observation_dim, *cfg.explore.encoder.hidden, d], "fwhff")
+    shapes += products(batch, [observation_dim, *cfg.exploration.encoder.hidden, d], "fwhff")
     shapes += products(batch, [action_dim, *body, d * (1 + 2 * d)], "fwh")
     return shapes + list(products(d * batch, decoder, "fwi"))
 
@@ -154,29 +151,24 @@ def plain_sac(cfg: Any, stage: Stage, library: str) -> Callable[[], object]:
     spec = Bounded(-1, 1, shape=(sizes["action"],))
     network = {"hidden": list(cfg.actor.hidden), "layer_norm": cfg.actor.layer_norm}
     actor = make_actor({"observation": sizes["observation"]}, spec, **network)
-    kind = SACLoss if library == "torchrl" else LeanSACLoss
-    loss = kind(actor, make_critic(sizes, **network), action_spec=spec)
-    target = ready_for_training(loss, gamma=0.99, tau=0.005)
-    parameters = list(loss.parameters())
-    if library == "torchrl":
-        target = SoftUpdate(loss, tau=0.005)
-        optimizer = torch.optim.Adam(parameters, lr=3e-4)
-    else:
-        optimizer = make_optimizer(CPU, (parameters, 3e-4))
+    critic = make_critic(sizes, **network)
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(TRANSITIONS), batch_size=cfg.learn.batch_size
     )
     buffer.extend(kept)
-
-    def gradients(batch: TensorDict) -> tuple[torch.Tensor, ...]:
-        out = loss(batch)
-        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
-        return torch.autograd.grad(total, parameters)
-
-    differentiate = compiled(gradients) if library == "compiled" else gradients
+    if library != "torchrl":
+        learner = SACLearner(actor, critic, action_spec=spec, compile=library == "compiled")
+        return lambda: learner.update(buffer.sample())
+    loss = SACLoss(actor, critic, action_spec=spec)
+    loss.make_value_estimator(gamma=0.99)
+    target, parameters = SoftUpdate(loss, tau=0.005), list(loss.parameters())
+    optimizer = torch.optim.Adam(parameters, lr=3e-4)
 
     def run() -> None:
-        for parameter, gradient in zip(parameters, differentiate(buffer.sample()), strict=True):
+        out = loss(buffer.sample())
+        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+        gradients = torch.autograd.grad(total, parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         optimizer.step()
         target.step()
