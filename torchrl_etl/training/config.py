@@ -107,7 +107,13 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a whole number from 0 to 2147483647",
         lambda v: _integer(v) and 0 <= v < 2**31,
-        ("seed", "evaluation.every", "explore.fit.final_updates", *_both("learning_starts")),
+        (
+            "seed",
+            "evaluation.every",
+            "explore.fit.final_updates",
+            "learn.init_random_frames",
+            *_both("learning_starts"),
+        ),
     ),
     (
         "a whole number above 0 or null",

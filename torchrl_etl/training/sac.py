@@ -19,6 +19,7 @@ from torchrl_etl.modules import (
     HeldNoise,
     ReturnScale,
     RunningNorm,
+    UniformWarmup,
     make_actor,
     make_critic,
     normalize_rows,
@@ -58,6 +59,8 @@ class SACStage(Stage):
             and learns) and ``n_steps`` (rewards in a critic's target before it bootstraps; fewer
             at the end of a batch or an episode. Of the steps between, which the target takes as
             they were collected, no entropy counts).
+        init_random_frames (int): frames at the beginning whose actions are uniform within the
+            bounds of what the actor emits. Default: 0.
         **stage: see :class:`~torchrl_etl.training.stage.Stage`.
 
     Raises:
@@ -77,11 +80,13 @@ class SACStage(Stage):
         critic: Mapping[str, Any],
         sac: Mapping[str, Any],
         device: torch.device,
+        init_random_frames: int = 0,
         **stage: Any,
     ) -> None:
         torch.manual_seed(stage["seed"])
         check_choice("sac.noise", sac["noise"], get_args(Noise))
         self.hold = sac["hold"]
+        self._frames_per_action = frames_per_action(**stage)
         muscles = spec.full_action_spec_unbatched["action"].to(device)
         self.observation_dim = spec.observation_spec["observation"].shape[-1]
         self.norm = None
@@ -96,8 +101,14 @@ class SACStage(Stage):
         self.multi_step = None
         if sac["n_steps"] > 1:
             self.multi_step = ContinuedMultiStep(sac["gamma"], sac["n_steps"])
-        policy = self.policy_of(self.from_raw(self.exploring(sac["noise"])))
-        super().__init__(make_env, policy, device=device, **stage)
+        policy = self.from_raw(self.exploring(sac["noise"]))
+        self.warmup = None
+        if init_random_frames:
+            self.warmup = UniformWarmup(
+                self.action_spec, self.actions(init_random_frames), action_key=out_key
+            )
+            policy = TensorDictSequential(policy, self.warmup)
+        super().__init__(make_env, self.policy_of(policy), device=device, **stage)
         bound = sac["return_bound"]
         self.return_scale = None
         if bound is not None:
@@ -120,6 +131,10 @@ class SACStage(Stage):
         self.schedule = LambdaLR(
             self.optimizer, lambda _: 1.0 - falls * min(1.0, self.frames / self.budget)
         )
+
+    def actions(self, frames: int) -> int:
+        """Actions of each worker, all its rows counted, in so many frames of the run."""
+        return frames // self._frames_per_action
 
     # What other learners fill in ---------------------------------------------------------------
 
@@ -221,6 +236,8 @@ class SACStage(Stage):
             self.return_scale.forget()
         if self.multi_step is not None:
             self.multi_step.forget()
+        if self.warmup is not None:
+            self.warmup.seen = self.actions(self.frames)  # a resumed run goes on where it was
         super().restart_collection()
 
     def seen(self, batch: TensorDictBase) -> TensorDictBase:
@@ -231,6 +248,16 @@ class SACStage(Stage):
         if self.norm is not None:
             self.norm.see(batch["observation"])
         return batch
+
+
+def frames_per_action(*, collector: Mapping[str, Any], action_repeat: int = 1, **stage: Any) -> int:
+    """Frames of a run for each action of one of its workers.
+
+    Examples:
+        >>> frames_per_action(collector={"kind": "process", "num_workers": 4}, action_repeat=2)
+        8
+    """
+    return action_repeat * (1 if collector["kind"] == "single" else collector["num_workers"])
 
 
 def episodes(batch: TensorDictBase) -> Tensor:
