@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from tests.configs import CONF, tiny
@@ -37,6 +39,32 @@ def test_a_file_names_itself_and_makes_stages(method):
     assert made.method.name == method
     synergies = min(made.num_synergies, 6)
     Experiment(tiny(f"method={method}", "run_dir=unused", ELBOW, f"num_synergies={synergies}"))
+
+
+# What their public code says, in the project's words.
+PUBLISHED = {
+    "lattice_paper": {
+        "method.options.state_dependent": True,
+        "method.options.freq": 8,
+        "collector.num_envs": 16,
+        "collector.frames_per_batch": 128,
+        "learn.updates_per_frame": 8 / 128,
+        "learn.init_random_frames": 10_000,
+        "learn.buffer_size": 300_000,
+        "learn.sac.gamma": 0.98,
+        "learn.sac.tau": 0.02,
+        "learn.sac.normalize_observations": True,
+        "learn.actor.hidden": [400, 300],
+    },
+}
+
+
+@pytest.mark.parametrize("method", PUBLISHED)
+def test_presets_of_papers_have_the_published_numbers(method):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        made = compose("config", overrides=[f"method={method}"])
+    values = {key: OmegaConf.select(made, key) for key in PUBLISHED[method]}
+    assert values == PUBLISHED[method]
 
 
 @pytest.mark.slow
@@ -73,7 +101,9 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice"])  # losses or actors of their own
+@pytest.mark.parametrize(
+    "method", ["dynsyn", "eme", "lattice", "lattice_plain"]
+)  # losses or actors of their own
 def test_a_rival_compiles(method, tmp_path):
     stage = Experiment(config(method, tmp_path / "run", "compile=true")).learn_stage(None)
     stage.restart_collection()
