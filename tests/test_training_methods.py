@@ -56,6 +56,16 @@ PUBLISHED = {
         "learn.sac.normalize_observations": True,
         "learn.actor.hidden": [400, 300],
     },
+    "dep_paper": {
+        "method.options.dep_frames": 200_000,
+        "method.options.normalize": "columns",
+        "learn.learning_starts": 200_000,
+        "learn.updates_per_frame": 0.03,
+        "learn.sac.n_steps": 3,
+        "learn.actor.hidden": [1024, 1024],
+        "learn.critic.hidden": [1024, 1024],
+    },
+    "eme_paper": {"method.options.weight": 1.0, "method.options.normalize": False},
 }
 
 
@@ -110,6 +120,46 @@ def test_a_rival_compiles(method, tmp_path):
     stage.collect()
     assert all(value.isfinite().all() for value in stage.update().values())
     stage.close()
+
+
+def test_eme_measures_with_the_discount_of_its_learner(tmp_path):
+    settings = ("method=eme", "learn.sac.gamma=0.83", f"run_dir='{tmp_path}/run'")
+    stage = Experiment(tiny(*settings)).learn_stage(None)
+    assert stage.metric.gamma == 0.83
+    assert stage.sac.value_estimator.gamma.item() == pytest.approx(0.83)
+
+
+def test_eme_saves_the_units_of_its_bonus(tmp_path):
+    stage = Experiment(tiny("method=eme", f"run_dir='{tmp_path}/run'")).learn_stage(None)
+    assert stage.bonus.deviation is not None
+    assert stage.parts()["bonus"] is stage.bonus
+    assert stage.bonus in list(stage.buffer.transform)
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("eme", "method.options.gamma is none of the options of method=eme .*learn.sac.gamma"),
+        ("lattice", "method.options.gamma is none of the options of method=lattice"),
+        ("sac", "method.options.gamma is none of the options of method=sac .it has none"),
+        ("sar", "method.options.gamma is none of the options of method=sar"),
+    ],
+)
+def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Experiment(
+            tiny(f"method={method}", "+method.options.gamma=0.99", f"run_dir='{tmp_path}/run'")
+        )
+
+
+@pytest.mark.parametrize(("starts", "expected"), [(100, 640), (1000, 1000)])
+def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
+    settings = ("method.options.dep_frames=640", f"learn.learning_starts={starts}")
+    workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
+    run = config("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
+    stage = Experiment(run).learn_stage(None)
+    assert stage.learning_starts == expected
+    assert stage.controller.dep_frames == 640 // 2 // 2  # actions of each worker
 
 
 @pytest.mark.slow

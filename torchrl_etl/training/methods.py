@@ -44,10 +44,20 @@ class Method:
 
     frames = 0
     env_options: ClassVar[Mapping[str, bool]] = {}
+    takes: ClassVar[tuple[str, ...]] = ()
+    """Names of the method's own options."""
 
     def __init__(self, run: Experiment) -> None:
         self.run = run
         self.options = dict(run.config.method.get("options", {}))
+        for name in self.options:
+            if name not in self.takes:
+                method = run.config.method.name
+                raise ValueError(
+                    f"method.options.{name} is none of the options of method={method} "
+                    f"({', '.join(self.takes) or 'it has none'}); settings of the learner, such as "
+                    "the discount, are those of learn, such as learn.sac.gamma."
+                )
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
         """Find out what the stage needs and leave it in the run folder; facts for the summary.
@@ -66,24 +76,32 @@ class Method:
 
 
 class Lattice(Method):
+    takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
+
     def stage(self) -> SACStage:
         return LatticeStage(**self.common(), lattice=self.options)
 
 
 class DEP(Method):
     env_options: ClassVar[Mapping[str, bool]] = {"muscle_lengths": True}
+    takes = ("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau")
+    takes += ("bias_rate", "time_distance", "s4avg", "normalize")
 
     def stage(self) -> SACStage:
         return DEPStage(**self.common(), dep=self.options)
 
 
 class EME(Method):
+    takes = ("embedding_dim", "hidden", "ensemble", "lr", "tau", "weight", "normalize", "max_scale")
+
     def stage(self) -> SACStage:
         return EMEStage(**self.common(), eme=self.options)
 
 
 class DynSyn(Method):
     """Groups muscles by how their lengths go together while joints are thrown about."""
+
+    takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
 
     def __init__(self, run: Experiment) -> None:
         super().__init__(run)
@@ -117,6 +135,9 @@ class DynSyn(Method):
 
 class SAR(Method):
     """Plays with plain SAC and takes synergies from the muscles of the best episodes."""
+
+    takes = ("play_task", "frames", "rollout_frames", "preview_episodes", "percentile")
+    takes += ("num_synergies", "blend")
 
     def __init__(self, run: Experiment) -> None:
         super().__init__(run)

@@ -58,25 +58,32 @@ class LatticeStage(SACStage):
 class DEPStage(SACStage):
     """DEP (Schumacher 2023): now and then a controller of muscle lengths acts instead.
 
+    Learning starts when DEP has acted alone, as in the public code.
+
     Deviates: its learner is MPO; here it is SAC, the same as everyone's.
 
     Keyword Args:
-        dep (mapping): keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`.
+        dep (mapping): keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, but
+            ``dep_frames`` counts frames of the run, those of all workers.
         **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`; ``make_env`` must give
             ``muscle_length``.
     """
 
-    def __init__(self, *args: Any, dep: Mapping[str, Any], **sac_stage: Any) -> None:
+    def __init__(
+        self, *args: Any, dep: Mapping[str, Any], learning_starts: int, **sac_stage: Any
+    ) -> None:
         self._dep = dep
-        super().__init__(*args, **sac_stage)
+        learning_starts = max(learning_starts, dep["dep_frames"])
+        super().__init__(*args, learning_starts=learning_starts, **sac_stage)
 
     def exploring(self, noise: str) -> TensorDictModuleBase:
-        self.controller = DEPExploration(self.action_spec, **self._dep)
+        alone = self.actions(self._dep["dep_frames"])
+        self.controller = DEPExploration(self.action_spec, **{**self._dep, "dep_frames": alone})
         return TensorDictSequential(super().exploring(noise), self.controller)
 
     def restart_collection(self) -> None:
         # A resumed run goes on where it was; the controller counts its actions.
-        self.controller.frames = self.frames // self.action_repeat
+        self.controller.frames = self.actions(self.frames)
         super().restart_collection()
 
 
@@ -120,22 +127,27 @@ class EMEStage(SACStage):
 
     Its bonus and its metric are of single steps: ``sac.n_steps`` is not read.
 
+    Its metric has the discount of the learner, ``sac.gamma``.
+
     Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
 
     Keyword Args:
         eme (mapping): ``embedding_dim`` and ``hidden`` of the encoder, ``ensemble`` (its size),
-            ``lr``, ``tau`` (of the target encoder), ``weight`` and ``max_scale`` of the bonus.
+            ``lr``, ``tau`` (of the target encoder), ``weight``, ``normalize`` and ``max_scale``
+            of :class:`~torchrl_etl.baselines.EMEBonus`.
         **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
     """
 
     reward = "total_reward"
 
-    def __init__(self, *args: Any, eme: Mapping[str, Any], **sac_stage: Any) -> None:
-        self._eme = eme
-        super().__init__(*args, **sac_stage)
-        self.buffer.append_transform(
-            EMEBonus(self.encoder, self.ensemble, weight=eme["weight"], max_scale=eme["max_scale"])
-        )
+    def __init__(
+        self, *args: Any, eme: Mapping[str, Any], sac: Mapping[str, Any], **sac_stage: Any
+    ) -> None:
+        self._eme, self._gamma = eme, sac["gamma"]
+        super().__init__(*args, sac=sac, **sac_stage)
+        options = {key: eme[key] for key in ("weight", "max_scale", "normalize")}
+        self.bonus = EMEBonus(self.encoder, self.ensemble, **options)
+        self.buffer.append_transform(self.bonus)
         self.targets = [*self.targets, FusedSoftUpdate(self.metric, tau=eme["tau"])]
 
     def make_loss(self, critic: TensorDictModuleBase, **options: Any) -> LeanSACLoss:
@@ -146,7 +158,10 @@ class EMEStage(SACStage):
             observation_dim, action_dim, self._eme["ensemble"], hidden=hidden
         )
         self.metric = EMELoss(
-            self.encoder.to(self.device), self.ensemble.to(self.device), self.actor
+            self.encoder.to(self.device),
+            self.ensemble.to(self.device),
+            self.actor,
+            gamma=self._gamma,
         ).to(self.device)
         return super().make_loss(critic, **options)
 
@@ -162,4 +177,4 @@ class EMEStage(SACStage):
         return loss + metric["loss_metric"] + metric["loss_reward_ensemble"], scalars
 
     def parts(self) -> dict[str, Any]:
-        return {**super().parts(), "metric": self.metric}
+        return {**super().parts(), "metric": self.metric, "bonus": self.bonus}
