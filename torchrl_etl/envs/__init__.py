@@ -4,16 +4,20 @@ import gymnasium
 
 from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.envs.factory import actuator_names, make_env
+from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
 from torchrl_etl.envs.simulator import mujoco_state
 from torchrl_etl.envs.tasks import Task, episode_length, list_tasks, resolve_task
 from torchrl_etl.envs.wrappers import SimulationError
 
 __all__ = [
     "AnalyticOveractuated",
+    "JointTorques",
     "SimulationError",
     "Task",
     "actuator_names",
     "episode_length",
+    "excitation",
+    "joint_torques",
     "list_tasks",
     "make_env",
     "mujoco_state",
