@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,9 +14,11 @@ from tensordict import TensorDict
 
 from tests.configs import CONF, tiny
 from tests.test_training_resume import numbers
+from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
+from torchrl_etl.envs import make_env
 from torchrl_etl.training import Experiment, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.training.methods import PlayStage
+from torchrl_etl.training.methods import PlayStage, of_the_body
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
@@ -23,7 +26,11 @@ ELBOW = "env=myoElbowPose1D6MFixed-v0"
 BRIEFLY = {
     "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
     "dynsyn": ["method.options.frames=200"],
-    "sar": ["method.options.frames=448", "method.options.num_synergies=3"],
+    "sar": [
+        "method.options.frames=48",
+        "method.options.rollout_frames=400",
+        "method.options.num_synergies=3",
+    ],
     "eme": ["method.options.hidden=[16]"],
 }
 
@@ -186,21 +193,113 @@ def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     assert stage.sac.target_entropy == -len(set(groups))
 
 
-def test_play_keeps_the_steps_of_whole_episodes_with_their_returns():
-    done = torch.tensor([False, True, False, False, True])
-    episodes = torch.tensor([3, 3, 5, 7, 7])
-    so_far = torch.tensor([1.0, 4.0, 9.0, 2.0, 6.0])
-    following = {"done": done, "episode_reward": so_far, "activation": torch.eye(5)}
-    rows = TensorDict({"collector": {"traj_ids": episodes}, "next": following}, [5])
+def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
+    stage = Experiment(config("dynsyn", tmp_path / "run")).learn_stage(None)
+    network = stage.actor[0].module
+    assert stage.budget == 408  # 608 without the recording; a third of it is 136
+    for frames, amplitude in ((0, 0.0), (136, 0.0), (272, 0.05), (408, 0.1)):
+        stage.progress.frames = frames
+        set_frames(stage.actor, frames)
+        assert network.amplitude.item() == pytest.approx(amplitude, abs=1e-4)
+    stage.close()
+
+
+@pytest.mark.slow
+def test_dynsyn_evaluates_with_the_deviations_of_the_last_batch(tmp_path):
+    experiment = Experiment(config("dynsyn", tmp_path / "run"))
+    experiment.run()
+    stage = experiment.learned()
+    network = next(m for m in stage.trained_policy.modules() if isinstance(m, DynSynNetwork))
+    assert 0.08 < network.amplitude <= 0.1  # that of the last batch's first frame
+
+
+def test_the_papers_dynsyn_deviates_as_published(tmp_path):
+    made = tiny("method=dynsyn_paper", ELBOW, f"run_dir='{tmp_path}/run'", "learn.frames=3000000")
+    network = Experiment(made).learn_stage(None).actor[0].module
+    set_frames(network, 2_000_000)
+    assert network.amplitude.item() == pytest.approx(0.05)
+
+
+def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
+    following = {
+        "done": torch.tensor(done),
+        "episode_reward": torch.tensor(so_far),
+        "activation": torch.eye(len(done)),
+    }
+    return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
+
+
+def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
+    far = 5 + (2 << 32)  # an episode of another machine
+    rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
     found = PlayStage.finished_episodes(rows)
-    assert found["episodes"].tolist() == [3, 3, 7, 7]
+    assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
     assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
     assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
 
 
-def test_sar_asks_for_whole_episodes_before_it_begins(tmp_path):
-    with pytest.raises(ValueError, match=r"need 400 for an episode of 100 steps each"):
-        Experiment(config("sar", tmp_path / "run", "method.options.frames=300"))
+def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
+    sar = Experiment(config("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
+    # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
+    # taken, and 9 is though 11 is better.
+    rows = fresh([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
+    assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
+    # Of two episodes one is the preview at most, and of one none.
+    assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
+    assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
+
+
+def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
+    sar = Experiment(config("sar", tmp_path / "run", "learner=residual")).method
+    play = sar.play_stage()
+    play.restart_collection()
+    seen = play.collect()["next", "episode_reward"].clone()
+    before = {key: value.clone() for key, value in play.actor.state_dict().items()}
+    norm, frames, kept = play.norm.count.clone(), play.frames, len(play.buffer)
+    checks = []
+    rows = play.rollouts(400, lambda: checks.append(None))
+    assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
+    assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
+    assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
+    assert (play.frames, len(play.buffer), play.norm.count) == (frames, kept, norm)
+    assert all(torch.equal(value, before[key]) for key, value in play.actor.state_dict().items())
+
+
+@pytest.mark.slow
+def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
+    run = tmp_path / "run"
+    other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
+    experiment = Experiment(config("sar", run, other_task))
+    play = experiment.method.play_stage()
+    play.restart_collection()
+    goals = play.collect()["observation"]
+    play.close()
+    other = Experiment(config("sar", run)).method.play_stage()
+    other.restart_collection()
+    assert not torch.equal(other.collect()["observation"], goals)
+    other.close()
+    assert experiment.run()["learn"]["frames_charged"] >= 608
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("rollout_frames=300", r"need 400 for two whole episodes of 100 steps"),
+        ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
+    ],
+)
+def test_sar_objects_to_play_that_cannot_serve_before_it_begins(option, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Experiment(config("sar", tmp_path / "run", f"method.options.{option}"))
+
+
+def test_options_for_legs_and_hands_follow_the_root_of_the_body(tmp_path):
+    run = SimpleNamespace(spec=make_env("humanoid-stand"))
+    assert of_the_body({"legs": 1.0, "hands": 0.66}, run) == 1.0
+    assert of_the_body(0.5, run) == 0.5
+    assert Experiment(config("sar", tmp_path / "run")).method.blend == 0.66
+    one_number = config("dynsyn", tmp_path / "run", "method.options.amplitude=5")
+    assert Experiment(one_number).method.amplitude == 5
 
 
 def test_a_rival_has_no_stage_to_choose_and_no_synergies_to_take(tmp_path):

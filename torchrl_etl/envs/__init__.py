@@ -3,6 +3,7 @@
 import gymnasium
 
 from torchrl_etl.envs.analytic import AnalyticOveractuated
+from torchrl_etl.envs.body import body_joints, has_free_root
 from torchrl_etl.envs.factory import actuator_names, make_env
 from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
 from torchrl_etl.envs.simulator import mujoco_state
@@ -15,8 +16,10 @@ __all__ = [
     "SimulationError",
     "Task",
     "actuator_names",
+    "body_joints",
     "episode_length",
     "excitation",
+    "has_free_root",
     "joint_torques",
     "list_tasks",
     "make_env",

@@ -177,13 +177,13 @@ class Experiment:
         given = self.config.explore.frames if self._reuses else 0
         return LearnStage(**self.learner_options(), decoder=decoder, given=given, **tuning)
 
-    def learner_options(self, **env_options: bool) -> dict[str, Any]:
-        """Arguments that every stage takes that learns the task, as configured."""
+    def learner_options(self, task: str | None = None, **env_options: bool) -> dict[str, Any]:
+        """Arguments that every stage takes that learns the task, or another one, as configured."""
         options = self._options("learn")
         for of_a_decoder in ("fine_tuning", "decoder_lr", "anchor", "reuse_exploration"):
             del options[of_a_decoder]
         return {
-            "make_env": self._env_maker(**env_options),
+            "make_env": self._env_maker(task, **env_options),
             "spec": self.spec,
             "seed": 2 * self.config.seed + 1,
             "device": self.device,
@@ -298,13 +298,17 @@ class Experiment:
 
     # Shared ------------------------------------------------------------------------------------
 
-    def _env_maker(self, **options: bool) -> Callable[[], TransformedEnv]:
-        """Builds the simulators of one collector; it is sent to other processes as it is."""
+    def _env_maker(self, task: str | None = None, **options: bool) -> Callable[[], TransformedEnv]:
+        """Builds the simulators of one collector; it is sent to other processes as it is.
+
+        Another task than the run's has the goal that its name says.
+        """
+        variant = self._variant if task is None else {**self._variant, "goal": None}
         return partial(
             _env_of_a_collector,
-            self.config.env,
+            task or self.config.env,
             num_envs=self.config.collector.num_envs,
-            **self._variant,
+            **variant,
             **options,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -17,13 +17,12 @@ from torchrl_etl.baselines import (
     group_muscles,
     record_muscle_lengths,
 )
-from torchrl_etl.envs import episode_length
+from torchrl_etl.envs import actuator_names, episode_length, has_free_root, make_env
 from torchrl_etl.modules.atomic_files import write_atomically
 from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.rivals import DEPStage, DynSynStage, EMEStage, LatticeStage
-from torchrl_etl.training.sac import SACStage
-from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.sac import SACStage, episodes
 
 if TYPE_CHECKING:
     from torchrl_etl.training.experiment import Experiment
@@ -98,6 +97,16 @@ class EME(Method):
         return EMEStage(**self.common(), eme=self.options)
 
 
+def of_the_body(option: float | Mapping[str, float], run: Experiment) -> float:
+    """An option as given, or the one for this body of the two for ``legs`` and for ``hands``.
+
+    Legs are what stands free: a body whose root floats.
+    """
+    if not isinstance(option, Mapping):
+        return option
+    return option["legs" if has_free_root(run.spec) else "hands"]
+
+
 class DynSyn(Method):
     """Groups muscles by how their lengths go together while joints are thrown about."""
 
@@ -106,7 +115,8 @@ class DynSyn(Method):
     def __init__(self, run: Experiment) -> None:
         super().__init__(run)
         self.frames = self.options.pop("frames")
-        self.amplitude, self.share = self.options.pop("amplitude"), self.options.pop("group_share")
+        self.amplitude = of_the_body(self.options.pop("amplitude"), run)
+        self.share = of_the_body(self.options.pop("group_share"), run)
         self.file = run.path / "muscle_groups.json"
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
@@ -134,38 +144,65 @@ class DynSyn(Method):
 
 
 class SAR(Method):
-    """Plays with plain SAC and takes synergies from the muscles of the best episodes."""
+    """Plays with plain SAC and takes synergies from the muscles of the best of fresh episodes.
+
+    Deviates: the frames of the rollouts are charged too, so they are few; the first of them,
+    half at most, are the preview of whose returns the percentile is taken.
+    """
 
     takes = ("play_task", "frames", "rollout_frames", "preview_episodes", "percentile")
     takes += ("num_synergies", "blend")
 
     def __init__(self, run: Experiment) -> None:
         super().__init__(run)
-        self.frames, self.percentile = self.options["frames"], self.options["percentile"]
+        self.rollout_frames = self.options["rollout_frames"]
+        self.frames = self.options["frames"] + self.rollout_frames
         self.num_synergies = min(self.options["num_synergies"], len(run.actuators))
+        self.blend = of_the_body(self.options["blend"], run)
         self.file = run.path / "sar.safetensors"
-        steps = episode_length(run.config.env, run.config.goal) or 0
-        self.one_episode_each = steps * run.config.collector.num_envs
-        if self.frames < self.one_episode_each:
+        self.task = self.options["play_task"]
+        self.spec = run.spec
+        if self.task is not None:
+            self.spec = make_env(self.task, action_repeat=run.config.action_repeat)
+            if actuator_names(self.spec) != run.actuators:
+                raise ValueError(
+                    f"method.options.play_task is {self.task}, whose actuators are not those of "
+                    f"{run.config.env}; play on a task of the same body."
+                )
+        name, goal = (self.task, None) if self.task else (run.config.env, run.config.goal)
+        steps, simulators = episode_length(name, goal) or 0, run.config.collector.num_envs
+        if self.rollout_frames < (needed := steps * max(2, simulators)):
             raise ValueError(
-                f"method.options.frames is {self.frames}, but {run.config.collector.num_envs} "
-                f"simulators need {self.one_episode_each} for an episode of {steps} steps each, "
-                "and SAR takes the best of whole episodes; give more."
+                f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "
+                f"simulators need {needed} for two whole episodes of {steps} steps, and SAR takes "
+                "the best of whole episodes; give more."
             )
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
         if not self.file.is_file():
-            options = self.run.learner_options(activations=True)
-            play = PlayStage(**options | {"frames": self.frames})
-            loop = self.run.loop_options()
-            # Episodes begin anew after each checkpoint; some have to come to their end.
-            loop["checkpoint_every"] = max(loop["checkpoint_every"], 2 * self.one_episode_each)
-            run_stage(play, self.run.folder, stop, **loop)
-            rows = play.newest(self.frames)
-            actions = best_episodes(**play.finished_episodes(rows), percentile=self.percentile)
-            decoder = self.fit(actions)
+            play = self.play_stage()
+            run_stage(play, self.run.folder, stop, **self.run.loop_options())
+            decoder = self.fit(self.best(play.rollouts(self.rollout_frames, stop.check)))
             write_atomically(self.file, save(decoder.state_dict()))
         return {}
+
+    def play_stage(self) -> PlayStage:
+        """The stage whose policy plays, before its first frame."""
+        options = self.run.learner_options(self.task, activations=True)
+        return PlayStage(**options | {"spec": self.spec, "frames": self.options["frames"]})
+
+    def best(self, rows: TensorDictBase) -> Tensor:
+        """Activations of the episodes above the percentile of the preview, the first of them."""
+        found = PlayStage.finished_episodes(rows)
+        numbers = found["episodes"].unique()
+        preview = numbers[: min(self.options["preview_episodes"], len(numbers) // 2)]
+        returns = [found["returns"][found["episodes"] == number][:1] for number in preview]
+        fresh = ~torch.isin(found["episodes"], preview)
+        return best_episodes(
+            **{key: value[fresh] for key, value in found.items()},
+            percentile=self.options["percentile"],
+            preview=torch.cat(returns) if returns else None,
+        )
 
     def fit(self, actions: Tensor) -> SARDecoder:
         space = self.run.spec.full_action_spec_unbatched["action"].space
@@ -174,16 +211,14 @@ class SAR(Method):
             self.num_synergies,
             low=space.low,
             high=space.high,
-            blend=self.options["blend"],
+            blend=self.blend,
             seed=self.run.config.seed,
         )
 
     def stage(self) -> SACStage:
         space = self.run.spec.full_action_spec_unbatched["action"].space
         blank = torch.zeros(1 + self.num_synergies, len(self.run.actuators))
-        decoder = SARDecoder(
-            blank[0], blank[1:], low=space.low, high=space.high, blend=self.options["blend"]
-        )
+        decoder = SARDecoder(blank[0], blank[1:], low=space.low, high=space.high, blend=self.blend)
         if self.file.is_file():
             decoder.load_state_dict(load_file(self.file))
         tuning = {"fine_tuning": "frozen", "decoder_lr": 1e-6, "anchor": 0.0}
@@ -191,33 +226,43 @@ class SAR(Method):
 
 
 class PlayStage(SACStage):
-    """SAC on the task that remembers which muscle activations came of it, by episode.
-
-    They are of single steps: ``sac.n_steps`` is not read.
-    """
+    """SAC on the task to play with, and fresh rollouts of the policy that it has trained."""
 
     name = "play"
-    kept = ("observation", "action", ("collector", "traj_ids"))
 
-    spanned = Stage.spanned  # of single steps
+    def rollouts(self, frames: int, check: Callable[[], None]) -> TensorDictBase:
+        """Steps [N] of new episodes of the policy, acting as it explores, without learning.
 
-    def transitions(self, batch: TensorDictBase) -> TensorDictBase:
-        kept = super().transitions(batch)
-        kept["next"].update(batch["next"].select("activation", "episode_reward"))
-        return kept
+        Args:
+            frames (int): at least so many are collected.
+            check (callable): called before each batch; it may raise.
+        """
+        torch.manual_seed(self.seed)  # the same whether or not the run was resumed
+        kept = [("next", key) for key in ("activation", "episode_reward", "done")]
+        rows: list[TensorDictBase] = []
+        try:
+            self.restart_collection()
+            while self.action_repeat * sum(map(len, rows)) < frames:
+                check()
+                batch = self.batches.next().to(self.device)
+                steps = batch.select(*kept).set("episode", episodes(batch))
+                rows.append(steps.reshape(-1))
+        finally:
+            self.close()
+        return torch.cat(rows)
 
     @staticmethod
     def finished_episodes(rows: TensorDictBase) -> dict[str, Tensor]:
         """Activations [N, n], returns [N] and episodes [N] of the steps of whole episodes."""
-        episodes = rows["collector", "traj_ids"].reshape(-1)
+        numbers, episode = rows["episode"].unique(return_inverse=True)
         ends = rows["next", "done"].reshape(-1)
-        returns = torch.full((int(episodes.max()) + 1,), torch.nan)
-        returns[episodes[ends]] = rows["next", "episode_reward"].reshape(-1)[ends]
-        whole = returns[episodes].isfinite()
+        returns = torch.full(numbers.shape, torch.nan)
+        returns[episode[ends]] = rows["next", "episode_reward"].reshape(-1)[ends]
+        whole = returns[episode].isfinite()
         return {
             "actions": rows["next", "activation"][whole],
-            "returns": returns[episodes][whole],
-            "episodes": episodes[whole],
+            "returns": returns[episode][whole],
+            "episodes": episode[whole],
         }
 
 

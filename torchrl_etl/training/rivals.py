@@ -94,14 +94,20 @@ class DynSynStage(SACStage):
 
     Keyword Args:
         groups (sequence of int): the group of each muscle.
-        dynsyn (mapping): further arguments of :func:`~torchrl_etl.baselines.make_dynsyn_actor`.
+        dynsyn (mapping): further arguments of :func:`~torchrl_etl.baselines.make_dynsyn_actor`;
+            with ``start_share`` in place of ``start`` and ``slope``, weights deviate from that
+            share of the stage's frames on, linearly up to their ceiling at the last frame.
         **sac_stage: see :class:`~torchrl_etl.training.sac.SACStage`.
     """
 
     def __init__(
         self, *args: Any, groups: Sequence[int], dynsyn: Mapping[str, Any], **sac_stage: Any
     ) -> None:
-        self._groups, self._dynsyn = list(groups), dynsyn
+        self._groups, self._dynsyn = list(groups), dict(dynsyn)
+        if "start_share" in self._dynsyn:
+            start = self._dynsyn.pop("start_share") * sac_stage["frames"]
+            slope = self._dynsyn["ceiling"] / (sac_stage["frames"] - start)
+            self._dynsyn |= {"start": start, "slope": slope}
         super().__init__(*args, **sac_stage)
 
     def build_actor(self, inputs: Any, spec: Bounded, **options: Any) -> ProbabilisticActor:
