@@ -22,7 +22,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import ExplorationType, set_exploration_type
-from torchrl_etl.training.sac import SACStage
+from torchrl_etl.training.stage import Stage
 
 from torchrl_etl.command_line import one_sentence
 from torchrl_etl.experiment import Experiment
@@ -46,7 +46,7 @@ def main() -> None:
             stage = experiment.learned()  # or a clear sentence; then all that it has collected
         checkpoints = experiment.folder.checkpoints(stage.name)
         Checkpoints(checkpoints, keep_last=2).load_newest_whole(stage.checkpoint())
-        space = experiment.spec.full_action_spec_unbatched["action"].space
+        space = experiment.context.spec.action_spec.space
         of_run = json.loads((run / "versions.json").read_text())[-1]["commit"]
         row = {"task": config.env, "method": config.method.name, "seed": config.seed}
         row |= {"frames": stage.frames, "run_commit": of_run, **measured(stage, space)}
@@ -56,11 +56,11 @@ def main() -> None:
             append(arguments.out, row)
 
 
-def measured(stage: SACStage, space: ContinuousBox) -> dict[str, float]:
+def measured(stage: Stage, space: ContinuousBox) -> dict[str, float]:
     torch.manual_seed(0)
     rows = stage.newest(NEWEST)["observation"]
     seen = rows[torch.randperm(len(rows))[:OBSERVATIONS]]
-    policy = stage.policy_of(stage.from_raw(stage.actor))
+    policy = stage.learner.behavior
 
     @torch.no_grad()
     def muscles(kind: ExplorationType = ExplorationType.DETERMINISTIC) -> Tensor:

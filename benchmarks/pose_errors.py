@@ -34,7 +34,7 @@ def main() -> None:
     with one_sentence(ValueError, OSError):
         experiment = Experiment(resumed_config(arguments.run), resume=arguments.run)
         stage = experiment.learned()
-    env = experiment.evaluation_env(stage)
+    env = experiment.context.make_env()
     hand = simulator(env)
     errors = []
     torch.manual_seed(EVALUATION_SEED)
@@ -42,7 +42,7 @@ def main() -> None:
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         env.rollout(
             max(STEPS) + 2,  # TorchRL does not call back after the last
-            stage.trained_policy,
+            stage.learner.policy,
             callback=lambda *_: errors.append(hand.data.qpos - hand.target_jnt_value),
         )
     known = facts()

@@ -30,7 +30,7 @@ def explore(env: str, reading: str, seed: int, frames: int) -> dict[str, object]
     with tempfile.TemporaryDirectory() as folder:
         overrides = [
             f"env={env}",
-            f"faithful={reading}",
+            *(["faithful=paper"] if reading == "paper" else []),
             f"seed={seed}",
             f"explore.frames={frames}",
             "num_synergies=4",

@@ -59,6 +59,40 @@ def test_matrix_of_two_antagonists() -> None:
     close(controller.matrix()[0], [[2.2, -0.4], [-2.2, 0.4]])
 
 
+@pytest.mark.parametrize(
+    ("normalize", "expected"),
+    # The rows of C have lengths 5 and 13: of the paper each row becomes a unit vector, of the
+    # public code the first column is divided by 5 and the second by 13.
+    [
+        ("rows", [[3 / 5, 4 / 5], [5 / 13, -12 / 13]]),
+        ("columns", [[3 / 5, 4 / 13], [5 / 5, -12 / 13]]),
+    ],
+)
+def test_matrix_is_normalized_by_rows_or_by_columns(normalize: str, expected: Any) -> None:
+    controller = DEPController(1, 2, kappa=2.0, tau=2, time_distance=2, normalize=normalize)
+    # Two causes along the axes, two effects: C = -[m0 m2ᵀ + m1 m3ᵀ].
+    controller.moves = -torch.tensor([[[3.0, 5.0], [4.0, -12.0], [-1.0, 0.0], [0.0, -1.0]]])
+    close(controller.matrix()[0], [[3.0, 4.0], [5.0, -12.0]])
+    close(controller.weights()[0], [[2 * x for x in row] for row in expected])
+
+
+def test_a_command_can_have_another_sign_by_columns_than_by_rows() -> None:
+    commands = []
+    for normalize in ("rows", "columns"):
+        controller = DEPController(1, 2, kappa=2.0, tau=2, time_distance=2, normalize=normalize)
+        controller.moves = -torch.tensor([[[3.0, 5.0], [4.0, -12.0], [-1.0, 0.0], [0.0, -1.0]]])
+        controller.sensed = torch.tensor([[1.0, -0.9]])
+        drive = controller.weights()[0] @ controller.sensed[0]
+        commands.append(drive.sign().tolist())
+    # First muscle: 3 - 3.6 < 0 by rows, 3/5 - 3.6/13 > 0 by columns.
+    assert commands == [[-1.0, 1.0], [1.0, 1.0]]
+
+
+def test_an_unknown_normalization_is_refused() -> None:
+    with pytest.raises(ValueError, match="normalize is 'row'; choose one of rows, columns"):
+        DEPController(1, 2, normalize="row")  # type: ignore[arg-type]
+
+
 def test_commands_and_bias_of_two_antagonists() -> None:
     controller, (first, second, third, fourth) = antagonists(bias_rate=0.1)
     assert not first.any() and not second.any()  # no movement follows another yet

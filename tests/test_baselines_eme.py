@@ -290,6 +290,22 @@ def test_distances_on_a_cycle_come_to_the_fixed_point() -> None:
     torch.testing.assert_close((rows - rows.roll(-1, 0)).norm(dim=-1), expected, rtol=0.02, atol=0)
 
 
+@pytest.mark.parametrize(("gamma", "times"), [(0.95, 20), (0.99, 100), (0.0, 1)])
+def test_policies_that_always_differ_by_c_are_c_over_one_minus_gamma_apart(
+    gamma: float, times: int
+) -> None:
+    """d = c + gamma d: no reward, two states that never change, KL of N(0, 1) and N(2, 1) is 2."""
+    actor = policy([[0.0], [2.0]], [[1.0], [1.0]])
+    data = transitions([0, 1], [0, 1], [0.0, 0.0], [False, False], 2)
+    for distance, error in ((2.0 * times, 0.0), (2.0 * times + 1, (1 - gamma) ** 2)):
+        encoder = table([[0.0], [distance]])
+        out = EMELoss(encoder, predictors([[0.0], [0.0]]), actor, gamma=gamma, loss_function="l2")(
+            data
+        )
+        assert out["mean_policy_divergence"].item() == pytest.approx(2.0)
+        assert out["loss_metric"].item() == pytest.approx(error, abs=1e-6)
+
+
 def test_ensemble_agrees_where_it_has_learned_and_nowhere_else() -> None:
     torch.manual_seed(0)
     ensemble = RewardEnsemble(2, 1, hidden=(32,))

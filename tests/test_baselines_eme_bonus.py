@@ -147,6 +147,42 @@ def test_total_reward_is_the_tasks_plus_the_weighted_bonus(weight: float, total:
     assert data["next", "reward"].item() == 10.0
 
 
+def test_a_normalized_bonus_deviates_by_its_weight_in_deviations_of_the_reward() -> None:
+    # Bonuses 5 and 4 sqrt(13), rewards 10 and 16 with a deviation of 3.
+    transform = bonus_of_tables(weight=0.5, normalize=True)
+    data = transform(steps([0, 1], [1, 2], [10.0, 16.0]))
+    bonus = torch.tensor([[5.0], [4 * D12]])
+    deviation = (4 * D12 - 5.0) / 2
+    torch.testing.assert_close(data["next", "intrinsic_reward"], bonus)
+    added = data["next", "total_reward"] - data["next", "reward"]
+    torch.testing.assert_close(added, 0.5 * 3.0 * bonus / deviation)
+    torch.testing.assert_close(added.std(correction=0), torch.tensor(0.5 * 3.0))
+
+
+def test_a_normalized_bonus_does_not_grow_with_the_metric() -> None:
+    added = []
+    for scale in (1.0, 1000.0):
+        transform = bonus_of_tables(normalize=True)
+        transform.encoder.module.rows.data *= scale
+        data = transform(steps([0, 1], [1, 2], [10.0, 16.0]))
+        added.append(data["next", "total_reward"])
+    torch.testing.assert_close(*added)
+
+
+def test_a_normalized_bonus_counts_where_no_step_was_ever_rewarded() -> None:
+    data = bonus_of_tables(normalize=True)(steps([0, 1], [1, 2], [0.0, 0.0]))
+    assert data["next", "total_reward"].std(correction=0).item() == pytest.approx(1.0)
+
+
+def test_statistics_of_a_normalized_bonus_are_saved() -> None:
+    one, other = bonus_of_tables(normalize=True), bonus_of_tables(normalize=True)
+    one(steps([0, 1], [1, 2], [10.0, 16.0]))
+    other.load_state_dict(one.state_dict())
+    later = steps([1, 2], [2, 0], [3.0, 4.0])
+    results = [transform(later.clone())["next", "total_reward"] for transform in (one, other)]
+    assert torch.equal(*results)
+
+
 def test_time_dimensions() -> None:
     data = steps([0, 1], [1, 2], [0.0, 0.0]).reshape(1, 2)
     bonus = bonus_of_tables()(data)["next", "intrinsic_reward"]

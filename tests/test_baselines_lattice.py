@@ -191,11 +191,38 @@ def test_actor_has_the_printed_covariance() -> None:
     actor, data = actor_on(log_std_init=-1.0).double(), observations(5).double()
     network = actor[0].module
     features = network.features(data["observation"])
-    sigma = network.spread.head(features).clamp(math.log(1e-3), 0).exp()
+    sigma = network.spread.head(features).clamp(-20, 2).exp()
     weight = network.mean.weight
     expected = weight @ torch.diag_embed(sigma[:, :6].square()) @ weight.T
     expected = expected + torch.diag_embed(sigma[:, 6:].square())
     torch.testing.assert_close(covariance_of(actor, data), expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("raw", "variance"),
+    # W's rows are unit vectors: a diagonal entry is a feature's variance plus an actuator's.
+    [
+        (1.0, 2 * math.exp(2)),
+        (2.0, 2 * math.exp(4)),
+        (9.0, 2 * math.exp(4)),
+        (-3, 2 * math.exp(-6)),
+    ],
+)
+def test_plain_spread_is_bounded_as_its_authors_bound_it(raw: float, variance: float) -> None:
+    actor = make_lattice_actor({"observation": 4}, SPEC, hidden=(8,))
+    network = actor[0].module
+    with torch.no_grad():
+        network.mean.weight.copy_(torch.eye(3, 8))
+        network.spread.head.weight.zero_()
+        network.spread.head.bias.fill_(raw)
+    covariance = covariance_of(actor, observations(1))[0]
+    torch.testing.assert_close(covariance, variance * torch.eye(3), rtol=1e-4, atol=1e-6)
+    assert raw != 1.0 or round(variance, 2) == 14.78
+
+
+def test_state_dependent_spread_may_grow_to_ten_as_its_authors_have_it() -> None:
+    spread = actor_on(state_dependent=True)[0].module.spread
+    assert [round(math.exp(bound), 6) for bound in spread.bounds] == [0.001, 10.0]
 
 
 def test_state_dependent_actor_has_the_printed_covariance() -> None:
@@ -292,7 +319,8 @@ def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
     [
         ({"hidden": ()}, "hidden is empty"),
         ({"log_std_bounds": (0.0, -1.0)}, "low < high"),
-        ({"log_std_init": 1.0}, "low <= log_std_init <= high"),
+        ({"log_std_init": 3.0}, "low <= log_std_init <= high"),
+        ({"log_std_bounds": 2.0}, "pass a pair"),
         ({"alpha": -1.0}, "neither may be negative"),
         ({"std_reg": -1.0}, "neither may be negative"),
         ({"body": "conv"}, "choose one of mlp, residual"),

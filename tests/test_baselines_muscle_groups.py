@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from torchrl_etl.baselines.muscle_groups import group_muscles, record_muscle_lengths
-from torchrl_etl.envs import make_env
+from torchrl_etl.envs import body_joints, make_env, mujoco_state
 
 GROUPS = [0, 1, 0, 2, 1, 0]
 
@@ -102,19 +102,21 @@ BODY = """
 class TwoHinges(gym.Env):
     """Two joints with two actuators each, and a ball that floats; 7 steps an episode."""
 
-    action_space = spaces.Box(-1, 1, (4,), np.float32)
-    observation_space = spaces.Box(-np.inf, np.inf, (9,), np.float32)
-
-    def __init__(self) -> None:
-        self.model = mujoco.MjModel.from_xml_string(BODY)
+    def __init__(self, body: str = BODY) -> None:
+        self.model = mujoco.MjModel.from_xml_string(body)
         self.data = mujoco.MjData(self.model)
+        size = (self.model.nu,), (self.model.nq,)
+        self.action_space = spaces.Box(-1, 1, size[0], np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, size[1], np.float32)
         self.actions: list[np.ndarray] = []
-        self.velocities: list[np.ndarray] = []
+        self.velocities: list[np.ndarray] = []  # as a step begins
+        self.after: list[np.ndarray] = []
         self.steps = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
         self.steps = 0
         return self.data.qpos.astype(np.float32), {}
 
@@ -123,6 +125,7 @@ class TwoHinges(gym.Env):
         self.velocities.append(self.data.qvel.copy())
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, nstep=5)
+        self.after.append(self.data.qvel.copy())
         self.steps += 1
         return self.data.qpos.astype(np.float32), 0.0, False, self.steps == 7, {}
 
@@ -139,6 +142,54 @@ def test_recording_throws_joints_about_and_holds_what_floats() -> None:
     torch.testing.assert_close(lengths[:, 0], 2 * lengths[:, 2])
     torch.testing.assert_close(lengths[:, 1], lengths[:, 3])
     assert not lengths[7::7].any() and lengths[3:7].all()
+
+
+OBJECT = """
+<mujoco>
+  <worldbody>
+    <body name="arm"><joint name="arm" type="hinge" axis="0 1 0" damping="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" mass="1"/></body>
+    <body name="slider" pos="0.2 0 0.09">{joints}<geom size="0.05" mass="0.1"/>
+      <body name="knob" pos="0 0 0.06"><joint type="ball"/><geom size="0.01" mass="0.01"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="arm"/></actuator>
+</mujoco>
+"""
+SLIDES = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+
+
+@pytest.mark.parametrize("joints", ["<freejoint/>", SLIDES, '<joint type="hinge" axis="0 1 0"/>'])
+def test_objects_stay_where_they_are_whatever_they_hang_on(joints: str) -> None:
+    inner = TwoHinges(OBJECT.format(joints=joints))
+    colliding = inner.model.geom_contype.copy(), inner.model.geom_conaffinity.copy()
+    record_muscle_lengths(GymWrapper(inner), 30, amplitude=50.0, every=3)
+    arm, objects = np.abs(inner.data.qvel[:1]), np.abs(np.stack(inner.after)[:, 1:])
+    assert arm > 0.2 and not np.abs(np.stack(inner.velocities)[:, 1:]).any()
+    assert objects.max() < 0.3  # what gravity does in a step, and no blow of the arm
+    assert (colliding[0] == inner.model.geom_contype).all()
+    assert (colliding[1] == inner.model.geom_conaffinity).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "task", ["myoHandKeyTurn", "myoHandPenTwirl", "myoBaoding", "myoDieReorient", "myoRelocate"]
+)
+def test_no_object_of_a_task_is_thrown_while_its_hand_is(task: str, monkeypatch: Any) -> None:
+    env = make_env(task)
+    env.reset()
+    model, state = mujoco_state(env)
+    objects = np.repeat(~body_joints(model, state), np.diff(model.jnt_dofadr, append=model.nv))
+    after: list[np.ndarray] = []
+    step = env.step
+    monkeypatch.setattr(
+        env, "step", lambda data: (step(data), after.append(state.qvel.copy()))[0], raising=False
+    )
+    record_muscle_lengths(env, 60, amplitude=100.0)
+    velocities = np.abs(np.stack(after))
+    assert objects.any() and velocities[:, objects].max() < 0.5
+    assert velocities[:, ~objects].max() > 5
+    env.close()
 
 
 def test_recording_depends_on_the_seed_alone() -> None:

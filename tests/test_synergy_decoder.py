@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from torch import Tensor, nn
 from tests.test_modules import HIGH, LOW, bias_of_last_layer, same, uniform, weights
 from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.bundle import load_bundle, save_bundle
 
 
 @pytest.fixture(autouse=True)
@@ -162,3 +165,40 @@ def test_sums_in_the_corners_stay_within_the_bounds_and_right() -> None:
         slope = tanh_sum_log_slope(x, y)
         expected = tanh_sum_log_slope(x.double(), y.double()).float()
         torch.testing.assert_close(slope, expected)
+
+
+def test_directions_are_the_slope_at_the_center_and_bounds_hold_beyond() -> None:
+    center = torch.tensor([0.25, 0.0, 4.0, 0.3])
+    directions = torch.tensor([[1.0, 0.0, -2.0, 0.1], [0.0, 0.5, 0.0, -0.2]])
+    decoder = SynergyDecoder.from_directions(center, directions, low=LOW, high=HIGH)
+    at = torch.zeros(2)
+    torch.testing.assert_close(decoder.module(at), center)
+    slope = torch.autograd.functional.jacobian(decoder.module, at)
+    torch.testing.assert_close(slope, directions.mT)
+    far = decoder.module(torch.tensor([1.0, 1.0]))
+    # Muscle 0 in [0, 1]: tanh⁻¹(-0.5) + 2·1 / (1 - 0.5²) by hand.
+    torch.testing.assert_close(far[0], torch.tensor((math.tanh(2.117361) + 1) / 2))
+    assert ((far > decoder.low) & (far < decoder.high)).all()
+
+
+def test_a_decoder_of_directions_is_rebuilt_from_its_bundle(tmp_path: Path) -> None:
+    decoder = SynergyDecoder.from_directions(torch.zeros(4), torch.rand(2, 4), residual=0.5)
+    save_bundle(decoder, tmp_path / "synergies", task="toy", actuators=list("abcd"))
+    copy, info = load_bundle(tmp_path)
+    assert info.num_synergies == 2
+    synergy = uniform(20, dim=6)
+    assert torch.equal(copy.module(synergy), decoder.module(synergy))
+
+
+@pytest.mark.parametrize(
+    ("center", "directions", "words"),
+    [
+        (torch.zeros(4), torch.zeros(2, 3), r"center has shape \[4\] and directions \[2, 3\]"),
+        (torch.tensor([0.0, 1.0]), torch.zeros(1, 2), "Entry 1 of the center is not inside"),
+    ],
+)
+def test_directions_that_do_not_fit_are_refused(
+    center: Tensor, directions: Tensor, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        SynergyDecoder.from_directions(center, directions)

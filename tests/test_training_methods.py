@@ -7,14 +7,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from tensordict import TensorDict
-from torchrl_etl.training.methods import PlayStage
 
 from tests.configs import CONF, tiny
 from tests.test_training_resume import numbers
+from torchrl_etl.baselines import DEPExploration
+from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.methods.sar import finished_episodes, rollouts
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
@@ -22,7 +26,11 @@ ELBOW = "env=myoElbowPose1D6MFixed-v0"
 BRIEFLY = {
     "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
     "dynsyn": ["method.options.frames=200"],
-    "sar": ["method.options.frames=448", "method.options.num_synergies=3"],
+    "sar": [
+        "method.options.frames=48",
+        "method.options.rollout_frames=400",
+        "method.options.num_synergies=3",
+    ],
     "eme": ["method.options.hidden=[16]"],
 }
 
@@ -38,6 +46,42 @@ def test_a_file_names_itself_and_makes_stages(method):
     assert made.method.name == method
     synergies = min(made.num_synergies, 6)
     Experiment(tiny(f"method={method}", "run_dir=unused", ELBOW, f"num_synergies={synergies}"))
+
+
+# What their public code says, in the project's words.
+PUBLISHED = {
+    "lattice_paper": {
+        "method.options.state_dependent": True,
+        "method.options.freq": 8,
+        "collector.num_envs": 16,
+        "collector.frames_per_batch": 128,
+        "learn.replay_ratio": 8 / 128,
+        "learn.init_random_frames": 10_000,
+        "learn.buffer_size": 300_000,
+        "learn.sac.gamma": 0.98,
+        "learn.sac.tau": 0.02,
+        "learn.sac.normalize_observations": True,
+        "learn.actor.hidden": [400, 300],
+    },
+    "dep_paper": {
+        "method.options.dep_frames": 200_000,
+        "method.options.normalize": "columns",
+        "learn.learning_starts": 200_000,
+        "learn.replay_ratio": 0.03,
+        "learn.n_steps": 3,
+        "learn.actor.hidden": [1024, 1024],
+        "learn.critic.hidden": [1024, 1024],
+    },
+    "eme_paper": {"method.options.weight": 1.0, "method.options.normalize": False},
+}
+
+
+@pytest.mark.parametrize("method", PUBLISHED)
+def test_presets_of_papers_have_the_published_numbers(method):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        made = compose("config", overrides=[f"method={method}"])
+    values = {key: OmegaConf.select(made, key) for key in PUBLISHED[method]}
+    assert values == PUBLISHED[method]
 
 
 @pytest.mark.slow
@@ -74,23 +118,70 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice"])  # losses or actors of their own
+@pytest.mark.parametrize(
+    "method", ["dynsyn", "eme", "lattice", "lattice_plain"]
+)  # losses or actors of their own
 def test_a_rival_compiles(method, tmp_path):
-    stage = Experiment(config(method, tmp_path / "run", "compile=true")).learn_stage(None)
+    stage = Experiment(config(method, tmp_path / "run", "compile=true")).method.stage()
     stage.restart_collection()
     stage.collect()
     assert all(value.isfinite().all() for value in stage.update().values())
     stage.close()
 
 
+def test_eme_measures_with_the_discount_of_its_learner(tmp_path):
+    settings = ("method=eme", "learn.sac.gamma=0.83", f"run_dir='{tmp_path}/run'")
+    objective = Experiment(tiny(*settings)).method.stage().learner.objective
+    assert objective.terms[0].loss.gamma == 0.83
+    assert objective.sac.value_estimator.gamma.item() == pytest.approx(0.83)
+
+
+def test_eme_saves_the_units_of_its_bonus(tmp_path):
+    stage = Experiment(tiny("method=eme", f"run_dir='{tmp_path}/run'")).method.stage()
+    (bonus,) = stage.transforms
+    assert bonus.deviation is not None
+    assert bonus in list(stage.buffer.transform)
+    assert "transforms" in stage.checkpoint().components
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("eme", "method.options.gamma is none of the options of method=eme .*learn.sac.gamma"),
+        ("lattice", "method.options.gamma is none of the options of method=lattice"),
+        ("sac", "method.options.gamma is none of the options of method=sac .it has none"),
+        ("sar", "method.options.gamma is none of the options of method=sar"),
+    ],
+)
+def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Experiment(
+            tiny(f"method={method}", "+method.options.gamma=0.99", f"run_dir='{tmp_path}/run'")
+        )
+
+
+def controller(stage) -> DEPExploration:
+    return next(m for m in stage.learner.behavior.modules() if isinstance(m, DEPExploration))
+
+
+@pytest.mark.parametrize(("starts", "expected"), [(100, 640), (1000, 1000)])
+def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
+    settings = ("method.options.dep_frames=640", f"learn.learning_starts={starts}")
+    workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
+    run = config("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
+    stage = Experiment(run).method.stage()
+    assert stage.learning_starts == expected
+    assert controller(stage).dep_frames == 640 // 2 // 2  # actions of each worker
+
+
 @pytest.mark.slow
 def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
-    stage = Experiment(config("dep", tmp_path / "run", "action_repeat=2")).learn_stage(None)
+    stage = Experiment(config("dep", tmp_path / "run", "action_repeat=2")).method.stage()
     stage.restart_collection()
     actions = stage.collect().numel()
-    assert stage.frames == 2 * actions and stage.controller.frames == actions
+    assert stage.frames == 2 * actions and controller(stage).frames == actions
     stage.restart_collection()
-    assert stage.controller.frames == actions
+    assert controller(stage).frames == actions
     stage.close()
 
 
@@ -99,32 +190,124 @@ def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     groups = experiment.run()["groups"]
     assert groups == json.loads((tmp_path / "run" / "muscle_groups.json").read_text())
     stage = experiment.learned()
-    observation = torch.randn(50, stage.observation_dim)
-    action = stage.actor(TensorDict({"observation": observation}, [50]))["action"]
+    observation = torch.randn(50, experiment.context.spec.observation_dim)
+    action = stage.learner.actor(TensorDict({"observation": observation}, [50]))["action"]
     for group in set(groups):
         members = action[:, [i for i, g in enumerate(groups) if g == group]]
         assert (members == members[:, :1]).all()
-    assert stage.sac.target_entropy == -len(set(groups))
+    assert stage.learner.objective.sac.target_entropy == -len(set(groups))
 
 
-def test_play_keeps_the_steps_of_whole_episodes_with_their_returns():
-    done = torch.tensor([False, True, False, False, True])
-    episodes = torch.tensor([3, 3, 5, 7, 7])
-    so_far = torch.tensor([1.0, 4.0, 9.0, 2.0, 6.0])
-    following = {"done": done, "episode_reward": so_far, "activation": torch.eye(5)}
-    rows = TensorDict({"collector": {"traj_ids": episodes}, "next": following}, [5])
-    found = PlayStage.finished_episodes(rows)
-    assert found["episodes"].tolist() == [3, 3, 7, 7]
+def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
+    stage = Experiment(config("dynsyn", tmp_path / "run")).method.stage()
+    network = stage.learner.actor[0].module
+    assert stage.budget == 408  # 608 without the recording; a third of it is 136
+    for frames, amplitude in ((0, 0.0), (136, 0.0), (272, 0.05), (408, 0.1)):
+        stage.progress.frames = frames
+        set_frames(stage.learner.actor, frames)
+        assert network.amplitude.item() == pytest.approx(amplitude, abs=1e-4)
+    stage.close()
+
+
+@pytest.mark.slow
+def test_dynsyn_evaluates_with_the_deviations_of_the_last_batch(tmp_path):
+    experiment = Experiment(config("dynsyn", tmp_path / "run"))
+    experiment.run()
+    stage = experiment.learned()
+    network = next(m for m in stage.learner.policy.modules() if isinstance(m, DynSynNetwork))
+    assert 0.08 < network.amplitude <= 0.1  # that of the last batch's first frame
+
+
+def test_the_papers_dynsyn_deviates_as_published(tmp_path):
+    made = tiny("method=dynsyn_paper", ELBOW, f"run_dir='{tmp_path}/run'", "learn.frames=3000000")
+    network = Experiment(made).method.stage().learner.actor[0].module
+    set_frames(network, 2_000_000)
+    assert network.amplitude.item() == pytest.approx(0.05)
+
+
+def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
+    following = {
+        "done": torch.tensor(done),
+        "episode_reward": torch.tensor(so_far),
+        "activation": torch.eye(len(done)),
+    }
+    return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
+
+
+def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
+    far = 5 + (2 << 32)  # an episode of another machine
+    rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
+    found = finished_episodes(rows)
+    assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
     assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
     assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
 
 
-def test_sar_asks_for_whole_episodes_before_it_begins(tmp_path):
-    with pytest.raises(ValueError, match=r"need 400 for an episode of 100 steps each"):
-        Experiment(config("sar", tmp_path / "run", "method.options.frames=300"))
+def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
+    sar = Experiment(config("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
+    # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
+    # taken, and 9 is though 11 is better.
+    rows = fresh([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
+    assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
+    # Of two episodes one is the preview at most, and of one none.
+    assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
+    assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
+
+
+def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
+    sar = Experiment(config("sar", tmp_path / "run", "learn.sac.normalize_observations=true")).method
+    play = sar.play_stage()
+    play.restart_collection()
+    seen = play.collect()["next", "episode_reward"].clone()
+    before = {key: value.clone() for key, value in play.learner.actor.state_dict().items()}
+    norm, frames, kept = play.learner.objective.normalizer.count.clone(), play.frames, len(play.buffer)
+    checks = []
+    rows = rollouts(play, 400, lambda: checks.append(None))
+    assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
+    assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
+    assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
+    assert (play.frames, len(play.buffer), play.learner.objective.normalizer.count) == (frames, kept, norm)
+    assert all(torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items())
+
+
+@pytest.mark.slow
+def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
+    run = tmp_path / "run"
+    other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
+    experiment = Experiment(config("sar", run, other_task))
+    play = experiment.method.play_stage()
+    play.restart_collection()
+    goals = play.collect()["observation"]
+    play.close()
+    other = Experiment(config("sar", run)).method.play_stage()
+    other.restart_collection()
+    assert not torch.equal(other.collect()["observation"], goals)
+    other.close()
+    assert experiment.run()["learn"]["frames_charged"] >= 608
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("rollout_frames=300", r"need 400 for two whole episodes of 100 steps"),
+        ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
+    ],
+)
+def test_sar_objects_to_play_that_cannot_serve_before_it_begins(option, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Experiment(config("sar", tmp_path / "run", f"method.options.{option}"))
+
+
+def test_options_for_legs_and_hands_follow_the_root_of_the_body(tmp_path):
+    of_the_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.of_the_body
+    assert of_the_body({"legs": 1.0, "hands": 0.66}) == 1.0
+    assert of_the_body(0.5) == 0.5
+    assert Experiment(config("sar", tmp_path / "run")).method.blend == 0.66
+    one_number = config("dynsyn", tmp_path / "run", "method.options.amplitude=5")
+    assert Experiment(one_number).method.amplitude == 5
 
 
 def test_a_rival_has_no_stage_to_choose_and_no_synergies_to_take(tmp_path):
-    for override in ("stage=learn", "synergies=somewhere"):
+    for override in ("stage=learn", "synergies.bundle=somewhere"):
         with pytest.raises(ValueError, match="method=sac has one stage and no synergies"):
             Experiment(tiny("method=sac", override, f"run_dir='{tmp_path}/run'"))

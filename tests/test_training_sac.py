@@ -53,7 +53,9 @@ def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
     stage.close()
 
 
-@pytest.mark.parametrize("method", ["sac", "etl", "lattice", "dynsyn", "eme", "sar"])
+@pytest.mark.parametrize(
+    "method", ["sac", "etl", "lattice", "lattice_plain", "dynsyn", "eme", "sar"]
+)
 def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp_path):
     settings = ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
     stage = method_stage(method, *settings)

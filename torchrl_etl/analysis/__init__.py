@@ -11,12 +11,14 @@ from torchrl_etl.analysis.diagnostics import (
     synergy_warnings,
     variance_accounted_for,
 )
+from torchrl_etl.analysis.joint_effects import JointEffects, joint_effects
 from torchrl_etl.analysis.pictures import embedding, learning_curves, synergy_heatmap, vaf_curve
 from torchrl_etl.analysis.statistics import Interval, interval, success_interval
 from torchrl_etl.analysis.synergy_report import describe_synergies, draw_synergies
 
 __all__ = [
     "Interval",
+    "JointEffects",
     "MixtureUsage",
     "control_authority",
     "describe_synergies",
@@ -24,6 +26,7 @@ __all__ = [
     "draw_synergies",
     "embedding",
     "interval",
+    "joint_effects",
     "learning_curves",
     "mixture_usage",
     "nmf_vaf",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -10,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_choice, check_positive
 
 __all__ = ["DEPController", "DEPExploration"]
 
@@ -30,15 +32,17 @@ class DEPController:
         | :math:`s = 2[(l - l_{min})/(l_{max} - l_{min} + 0.1) - 1/2]`
         | :math:`x \leftarrow x + (s - x)/s_{4avg}, \quad \Delta x(t) = x(t) - x(t - 1)`
         | :math:`C = \sum_{k<\tau} [M \Delta x(t - k)]\, \Delta x(t - k - \Delta)^T`
-        | :math:`\bar C_i = \kappa C_i / (\|(C M^T)_i\| + tiny)`
+        | :math:`\bar C_i = \kappa C_i / (\|(C M^T)_i\| + tiny)`, or with ``normalize="columns"``
+        | :math:`\bar C_{ij} = \kappa C_{ij} / (\|(C M^T)_j\| + tiny)`
         | :math:`q = \bar C x, \quad q \leftarrow q/(\|q\| + tiny)`
         | :math:`h \leftarrow h - clip(bias\_rate \cdot y(t - 1), \pm 0.05) - 0.001 h`
         | :math:`y = \tanh(\kappa q + h)`
 
-    Deviates: from the public code, which leaves the latest movement out of the sum (so that it has
-    two terms fewer), and which takes the jump of the body to a new episode for a movement;
-    here :meth:`reset` says that it is none. Of its buffer of 200 steps only the last τ + Δ
-    movements are ever read, so no others are kept.
+    Deviates: from the public code, which scales columns instead of rows (``normalize="columns"``; 6
+    to 10 % of commands get another sign), leaves the latest movement out of the sum (so that it has
+    two terms fewer), and takes the jump of the body to a new episode for a movement; here
+    :meth:`reset` says that it is none. Of its buffer of 200 steps only the last τ + Δ movements are
+    ever read, so no others are kept.
 
     Args:
         rows (int): number of bodies.
@@ -50,6 +54,9 @@ class DEPController:
         bias_rate (float): how fast a command that lasts is worn down. Default: 0.002.
         time_distance (int): Δ, how many steps movements precede those they cause. Default: 5.
         s4avg (float): how many steps the sensor is smoothed over, 1 for none. Default: 2.
+        normalize (str): what the lengths of the rows of C divide: ``"rows"``, as in the paper, or
+            ``"columns"``, each that of the row with its index, as in the public code. Default:
+            ``"rows"``.
         device (torch.device, optional): where lengths will be.
         dtype (torch.dtype, optional): of lengths.
 
@@ -76,17 +83,19 @@ class DEPController:
         bias_rate: float = 0.002,
         time_distance: int = 5,
         s4avg: float = 2.0,
+        normalize: Literal["rows", "columns"] = "rows",
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         check_positive(num_muscles=num_muscles, tau=tau, time_distance=time_distance)
+        check_choice("normalize", normalize, ("rows", "columns"))
         if kappa <= 0 or bias_rate < 0 or s4avg < 1:
             raise ValueError(
                 f"kappa is {kappa}, bias_rate {bias_rate} and s4avg {s4avg}; they must be "
                 "positive, not negative, and at least 1."
             )
         self.kappa, self.tau, self.bias_rate = kappa, tau, bias_rate
-        self.time_distance, self.s4avg = time_distance, s4avg
+        self.time_distance, self.s4avg, self.normalize = time_distance, s4avg, normalize
         nothing = torch.zeros(rows, num_muscles, device=device, dtype=dtype)
         self.shortest, self.longest = nothing + torch.inf, nothing - torch.inf
         self.sensed, self.bias, self.command = nothing, nothing, nothing
@@ -120,9 +129,7 @@ class DEPController:
             Tensor: commands y [rows, n] in [-1, 1].
         """
         self._sense(lengths)
-        # Rows of C and of C Mᵀ have the same length, as M = -I.
-        weights = self.kappa * _unit(self.matrix())
-        drive = _unit(torch.einsum("rij,rj->ri", weights, self.sensed))
+        drive = _unit(torch.einsum("rij,rj->ri", self.weights(), self.sensed))
         worn = (self.bias_rate * self.command).clamp(-_BIAS_STEP, _BIAS_STEP)
         self.bias = self.bias - worn - _BIAS_DECAY * self.bias
         self.command = torch.tanh(self.kappa * drive + self.bias)
@@ -144,6 +151,13 @@ class DEPController:
         """C [rows, n, n], before it is normalised."""
         causes = self.moves[:, self.time_distance :]
         return -torch.einsum("rki,rkj->rij", self.moves[:, : self.tau], causes)
+
+    def weights(self) -> Tensor:
+        """C̄ [rows, n, n]."""
+        matrix = self.matrix()
+        # Rows of C and of C Mᵀ have the same length, as M = -I.
+        length = matrix.norm(dim=-1, keepdim=True) + _TINY
+        return self.kappa * matrix / (length if self.normalize == "rows" else length.mT)
 
 
 def _unit(vector: Tensor) -> Tensor:
@@ -229,7 +243,7 @@ class DEPExploration(TensorDictModuleBase):
         action_key: NestedKey = "action",
         length_key: NestedKey = "muscle_length",
         episode_key: NestedKey | None = "is_init",
-        **controller: float,
+        **controller: Any,
     ) -> None:
         if not isinstance(action_spec, Bounded):
             raise TypeError(

@@ -130,8 +130,9 @@ class EMELoss(LossModule):
         - ``effective_rank``: of the embeddings, detached; near 1 means one used dimension.
 
     Deviates:
-        - The public code never trains the metric, and PPO is its learner; this is the paper's
-          metric, made for any learner with a Gaussian policy below a tanh (SAC).
+        - The public code never trains the metric; this is the paper's, made for any learner with a
+          Gaussian policy below a tanh. Its learner is PPO in some tables and, to go by a weight
+          of soft updates and a learning rate of α in that of Robosuite, one like SAC there.
         - d is the L2 distance of embeddings, hence symmetric and zero for a state with itself,
           which a free network of both states would not be. KL is not symmetric: since a pair is
           as likely drawn either way round, d settles between KL(pi_i ‖ pi_j) and
@@ -155,7 +156,8 @@ class EMELoss(LossModule):
             the loss contain it.
 
     Keyword Args:
-        gamma (float): discount factor in [0, 1). Default: ``0.95``.
+        gamma (float): discount factor in [0, 1); that of the learner, since the metric is one of
+            its returns. Default: ``0.95``.
         policy_weight (float): weight of the policies' divergence. Default: ``1.0``.
         reward_difference (str): ``"sampled"`` or ``"corrected"``. Default: ``"sampled"``.
         loss_function (str): ``"smooth_l1"`` or ``"l2"``, of the distances.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_etl import functional
 from torchrl_etl.baselines.eme import diversity_scale
+from torchrl_etl.modules.running_deviation import RunningDeviation
 from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
 __all__ = ["EMEBonus"]
@@ -27,11 +28,14 @@ class EMEBonus(TransitionReward):
 
     Both networks are held by reference and belong to whoever trains them
     (:class:`~torchrl_etl.baselines.eme.EMELoss`): the transform evaluates them without gradients
-    on their own device, and its ``state_dict()`` is empty. In another process they are the copies
-    made when the worker started.
+    on their own device and saves none of them. In another process they are the copies made when
+    the worker started.
 
     Equation: ``b = d(s, s') min(max(Var_k r̂_k(s, a), 1), M)``, and ``r + weight b`` for the
-    learner.
+    learner; with ``normalize``, ``r + weight σ_r b / σ_b`` with running standard deviations.
+
+    Deviates: the public code adds up four terms (cosine distance, KL, error of the reward, capped
+    variance) where the paper has this product; ``normalize`` is in neither.
 
     Args:
         encoder (TensorDictModuleBase): φ, with one in-key and one out-key; d is the L2 distance of
@@ -42,6 +46,12 @@ class EMEBonus(TransitionReward):
     Keyword Args:
         weight (float): of the bonus in the total reward. Default: 1.
         max_scale (float): M, at least 1. Default: 10.
+        normalize (bool): the weight counts deviations: what the bonus adds deviates ``weight``
+            times as much as the task's reward. The metric grows without bound as the policy
+            becomes certain, since KL does, and an unscaled bonus with it. The scale is 1 while all
+            rewards were zero. Default: ``False``.
+        decay (float): in (0, 1); a call weighs ``1 - decay`` in the running statistics, which are
+            in the ``state_dict()``. Default: 0.99.
         in_keys (sequence of NestedKey): keys of observation and action. Default:
             ``("observation", "action")``.
         out_keys (sequence of NestedKey): keys of bonus and total reward, both below ``"next"``.
@@ -85,6 +95,8 @@ class EMEBonus(TransitionReward):
         *,
         weight: float = 1.0,
         max_scale: float = 10.0,
+        normalize: bool = False,
+        decay: float = 0.99,
         in_keys: Sequence[NestedKey] = ("observation", "action"),
         out_keys: Sequence[NestedKey] = ("intrinsic_reward", "total_reward"),
         reward_key: NestedKey = "reward",
@@ -106,6 +118,8 @@ class EMEBonus(TransitionReward):
         # eval mode under the learner's feet, and be saved twice.
         self._networks = (encoder, ensemble)
         self.weight, self.max_scale = weight, max_scale
+        self.deviation = RunningDeviation(decay) if normalize else None
+        self.reward_deviation = RunningDeviation(decay) if normalize else None
         self.reward_key = unravel_key(reward_key)
 
     @property
@@ -136,7 +150,17 @@ class EMEBonus(TransitionReward):
         distance = functional.l2_distance(*ends.unbind(0)).unsqueeze(-1)
         scale = diversity_scale(evaluate(self.ensemble, observation, action), self.max_scale)
         bonus = distance.to(reward.device) * scale.to(reward.device)
-        return bonus, reward + self.weight * bonus
+        return bonus, reward + self.weight * self._in_units_of(reward, bonus)
+
+    def _in_units_of(self, reward: Tensor, bonus: Tensor) -> Tensor:
+        """The bonus, where normalized with the deviation of the rewards."""
+        if self.deviation is None or self.reward_deviation is None:
+            return bonus
+        self.deviation.update(bonus)
+        self.reward_deviation.update(reward)
+        rewarded = self.reward_deviation.mean.square() + self.reward_deviation.variance > 0
+        unit = torch.where(rewarded, self.reward_deviation.divisor, 1.0)
+        return unit * bonus / self.deviation.divisor
 
 
 def _check_keys(name: str, module: TensorDictModuleBase, reads: Sequence[str]) -> None:

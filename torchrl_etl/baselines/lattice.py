@@ -25,6 +25,11 @@ __all__ = [
 ]
 
 
+# Of log σ and of log S, as the public code has them.
+_PLAIN_BOUNDS = (-20.0, 2.0)
+_STATE_DEPENDENT_BOUNDS = (math.log(1e-3), math.log(10.0))
+
+
 class LatticeNormal(D.TransformedDistribution):
     """A Gaussian with full covariance, squashed by tanh and scaled to bounds.
 
@@ -246,7 +251,7 @@ def make_lattice_actor(
     layer_norm: bool = True,
     state_dependent: bool = False,
     log_std_init: float = 0.0,
-    log_std_bounds: tuple[float, float] = (math.log(1e-3), 0.0),
+    log_std_bounds: Sequence[float] | None = None,
     alpha: float = 1.0,
     std_reg: float = 1e-3,
 ) -> ProbabilisticActor:
@@ -273,7 +278,9 @@ def make_lattice_actor(
         body, hidden, layer_norm: as in :func:`~torchrl_etl.modules.make_actor`.
         state_dependent (bool): the second Σ. Default: ``False``.
         log_std_init (float): log σ (or log S) at the start. Default: 0.
-        log_std_bounds (tuple of float): its least and greatest value. Default: of σ in (1e-3, 1).
+        log_std_bounds (pair of float, optional): its least and greatest value. Default: those of
+            the public code, [-20, 2] for log σ and those of (1e-3, 10) for log S (for Humanoid and
+            Ant it takes (1e-3, 1)).
         alpha, std_reg (float): α ≥ 0 and std_reg ≥ 0, of the second Σ.
 
     Keys:
@@ -281,8 +288,8 @@ def make_lattice_actor(
         ``out_key`` [*, n] within the bounds.
 
     Raises:
-        ValueError: without a hidden layer, if bounds are not in order or do not hold the start, or
-            if alpha or std_reg is negative.
+        ValueError: without a hidden layer, if bounds are no pair in order or do not hold the start,
+            or if alpha or std_reg is negative.
 
     Examples:
         >>> import torch
@@ -293,6 +300,10 @@ def make_lattice_actor(
         >>> written["scale_tril"].shape, bool((written["action"] >= 0).all())
         (torch.Size([3, 5, 5]), True)
     """
+    if log_std_bounds is None:
+        log_std_bounds = _STATE_DEPENDENT_BOUNDS if state_dependent else _PLAIN_BOUNDS
+    if isinstance(log_std_bounds, (str, float, int)) or len(log_std_bounds) != 2:
+        raise ValueError(f"log_std_bounds is {log_std_bounds!r}; pass a pair, such as [-20, 2].")
     low, high = log_std_bounds
     if not low < high or not low <= log_std_init <= high:
         raise ValueError(

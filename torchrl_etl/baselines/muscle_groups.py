@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, step_mdp
 
+from torchrl_etl.envs import body_joints, mujoco_state
 from torchrl_etl.checks import check_positive
-from torchrl_etl.envs import mujoco_state
 
 __all__ = ["group_muscles", "record_muscle_lengths"]
 
@@ -22,11 +22,12 @@ def record_muscle_lengths(
     """Lengths of a body's actuators while its joints are thrown about.
 
     Every few steps the velocity of each joint is drawn from U(-1, 1)·amplitude; the action is zero
-    throughout. A root or an object that floats freely gets no velocity: what it does says nothing
-    about muscles.
+    throughout. Objects, on whatever joints they hang, and a root that floats freely stay where the
+    episode began, and nothing touches an object: what these do says nothing about muscles.
 
-    Deviates: free joints are held still; the original lets legs rise at 0.1 m/s and moves objects
-    away. Episodes end where the environment ends them. The original records 500,000 frames.
+    Deviates: the original lets legs rise at 0.1 m/s and sets objects a metre off, and goes on
+    where an episode ends, for 500 frames; here episodes end where the environment ends them, so
+    objects stay. The original records 500,000 frames.
 
     Args:
         env (EnvBase): of :func:`~torchrl_etl.envs.make_env`, on MuJoCo, with one simulator. It is
@@ -64,15 +65,19 @@ def record_muscle_lengths(
     data: TensorDictBase = env.reset()
     rest = env.full_action_spec[env.action_key].zero()
     model, state = mujoco_state(env)
-    floating = _floating(model)
     lengths = np.empty((frames, model.nu), dtype=np.float32)
+    held = _Held(model, state)
     for frame in range(frames):
         if frame % every == 0:
             state.qvel[:] = amplitude * rng.uniform(-1, 1, model.nv)
-        state.qvel[floating] = 0
-        data = env.step(data.set(env.action_key, rest.clone()))
+        with held:
+            data = env.step(data.set(env.action_key, rest.clone()))
         lengths[frame] = state.actuator_length
-        data = env.reset() if data["next", "done"].any() else step_mdp(data)
+        if data["next", "done"].any():
+            data = env.reset()
+            held.remember()
+        else:
+            data = step_mdp(data)
     return torch.from_numpy(lengths)
 
 
@@ -143,10 +148,41 @@ def _numbered(labels: np.ndarray) -> Tensor:
     return torch.from_numpy(first.argsort().argsort()[label]).long()
 
 
-def _floating(model: mujoco.MjModel) -> np.ndarray:
-    """Which velocities [nv] belong to joints that leave a body free."""
-    floating = np.zeros(model.nv, dtype=bool)
-    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
-    for start in model.jnt_dofadr[free]:
-        floating[start : start + 6] = True
-    return floating
+class _Held:
+    """Objects and a free root, which begin every step where the episode began.
+
+    In the step nothing collides with an object, which a finger would only hit again and again. The
+    model is itself between steps: a reset may build on which geoms collide.
+    """
+
+    def __init__(self, model: mujoco.MjModel, state: mujoco.MjData) -> None:
+        self._model, self._state = model, state
+        own = body_joints(model, state)
+        held = ~own | (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+        self._positions = _entries(held, model.jnt_qposadr, model.nq)
+        self._velocities = _entries(held, model.jnt_dofadr, model.nv)
+        # Every geom that hangs on an object's joint, by its kinematic tree.
+        objects = np.unique(model.dof_treeid[model.jnt_dofadr[~own]])
+        self._geoms = np.isin(model.body_treeid[model.geom_bodyid], objects)
+        self.remember()
+
+    def remember(self) -> None:
+        """What is held stays as it is now, at the beginning of an episode."""
+        self._pose = self._state.qpos[self._positions].copy()
+
+    def __enter__(self) -> None:
+        self._state.qpos[self._positions] = self._pose
+        self._state.qvel[self._velocities] = 0
+        masks = (self._model.geom_contype, self._model.geom_conaffinity)
+        self._masks = [(mask, mask[self._geoms].copy()) for mask in masks]
+        for mask, _ in self._masks:
+            mask[self._geoms] = 0
+
+    def __exit__(self, *error: object) -> None:
+        for mask, before in self._masks:
+            mask[self._geoms] = before
+
+
+def _entries(joints: np.ndarray, first: np.ndarray, size: int) -> np.ndarray:
+    """Which entries of qpos or qvel [size] are of these joints, that begin at ``first``."""
+    return np.repeat(joints, np.diff(first, append=size))

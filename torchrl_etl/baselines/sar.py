@@ -186,11 +186,16 @@ class SARDecoder(SynergyMap):
 
 
 def best_episodes(
-    actions: Tensor, returns: Tensor, *, episodes: Tensor | None = None, percentile: float = 80.0
+    actions: Tensor,
+    returns: Tensor,
+    *,
+    episodes: Tensor | None = None,
+    percentile: float = 80.0,
+    preview: Tensor | None = None,
 ) -> Tensor:
     """The actions of those episodes whose return is above a percentile of all returns.
 
-    Where no episode lies above it, because several share the highest return, these are taken.
+    Where no episode lies above it, those with the highest return are taken.
 
     Args:
         actions (Tensor): one row for each step of each episode [N, n].
@@ -201,6 +206,8 @@ def best_episodes(
             percentile. Default: ``None``, where each counts by its steps: the same where
             episodes are equally long.
         percentile (float): in [0, 100]. Default: 80.
+        preview (Tensor, optional): returns of earlier episodes [M], one each, of which the
+            percentile is taken. Default: ``None``, where it is that of these episodes.
 
     Returns:
         Tensor: the rows of the best episodes, in their order.
@@ -215,6 +222,11 @@ def best_episodes(
         >>> best_episodes(torch.arange(10.0).unsqueeze(-1), returns)
         tensor([[0.],
                 [1.]])
+        >>> best_episodes(torch.arange(10.0).unsqueeze(-1), returns, preview=torch.tensor([3.5]))
+        tensor([[0.],
+                [1.],
+                [8.],
+                [9.]])
     """
     lengths = [len(actions), *(x.numel() for x in (returns, episodes) if x is not None)]
     if actions.ndim != 2 or len(set(lengths)) > 1 or not len(actions):
@@ -234,6 +246,8 @@ def best_episodes(
             raise ValueError(
                 "returns differ within an episode; give each row the return of its whole episode."
             )
+    if preview is not None:
+        counted = preview
     best = returns > float(np.percentile(counted.cpu().numpy(), percentile))
     return actions[best if best.any() else returns == returns.max()]
 

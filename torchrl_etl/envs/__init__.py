@@ -3,7 +3,9 @@
 import gymnasium
 
 from torchrl_etl.envs.analytic import AnalyticOveractuated
+from torchrl_etl.envs.body import body_joints, has_free_root
 from torchrl_etl.envs.factory import actuator_names, make_env
+from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
 from torchrl_etl.envs.simulator import mujoco_state
 from torchrl_etl.envs.spec import EnvironmentSpec
 from torchrl_etl.envs.tasks import Task, episode_length, list_tasks, resolve_task
@@ -12,10 +14,15 @@ from torchrl_etl.envs.wrappers import SimulationError
 __all__ = [
     "AnalyticOveractuated",
     "EnvironmentSpec",
+    "JointTorques",
     "SimulationError",
     "Task",
     "actuator_names",
+    "body_joints",
     "episode_length",
+    "excitation",
+    "has_free_root",
+    "joint_torques",
     "list_tasks",
     "make_env",
     "mujoco_state",

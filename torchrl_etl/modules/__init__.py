@@ -7,6 +7,7 @@ from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder, SynergyMap
+from torchrl_etl.modules.uniform_warmup import UniformWarmup
 from torchrl_etl.modules.unit_rows import normalize_rows
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "StateEncoder",
     "SynergyDecoder",
     "SynergyMap",
+    "UniformWarmup",
     "make_actor",
     "make_critic",
     "normalize_rows",

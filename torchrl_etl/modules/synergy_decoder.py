@@ -175,6 +175,65 @@ class SynergyDecoder(SynergyMap):
             scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
         return decoder
 
+    @classmethod
+    def from_directions(
+        cls,
+        center: Tensor,
+        directions: Tensor,
+        *,
+        low: float | Sequence[float] = -1.0,
+        high: float | Sequence[float] = 1.0,
+        residual: float = 0.0,
+        **keys: Any,
+    ) -> SynergyDecoder:
+        """An affine map, squashed into the bounds: a decoder without hidden layers.
+
+        Around its center it is linear, and it bends only where a muscle nears its bounds.
+
+        Equation: a = tanh(x + u·X) where the bounds are [-1, 1], x and X so that Dec(0) is the
+        center and ∂Dec(u)/∂u at 0 the directions.
+
+        Args:
+            center (Tensor): action [n] of coefficients 0, inside the bounds.
+            directions (Tensor): how far one unit of each coefficient moves it [d, n], in action
+                units.
+
+        Keyword Args:
+            low, high, residual, in_keys, out_keys: see the class.
+
+        Raises:
+            ValueError: if the shapes do not fit, or the center is not inside the bounds.
+
+        Examples:
+            >>> import torch
+            >>> decoder = SynergyDecoder.from_directions(
+            ...     torch.tensor([0.0, 0.5]), torch.tensor([[0.1, -0.1]])
+            ... )
+            >>> decoder(torch.tensor([[0.0], [0.01]]))
+            tensor([[0.0000, 0.5000],
+                    [0.0010, 0.4990]], grad_fn=...)
+        """
+        if center.ndim != 1 or directions.ndim != 2 or directions.shape[1] != len(center):
+            raise ValueError(
+                f"center has shape {list(center.shape)} and directions {list(directions.shape)}; "
+                "they must be [actuators] and [synergies, actuators]."
+            )
+        count, muscles = directions.shape
+        decoder = cls(count, muscles, low=low, high=high, hidden=(), residual=residual, **keys)
+        scaled = decoder.to(directions).module
+        unit = scaled.decoder.normalize(center)
+        if not (unit.abs() < 1).all():
+            raise ValueError(
+                f"Entry {int((~(unit.abs() < 1)).nonzero()[0])} of the center is not inside the "
+                "action bounds, where nothing could move it; move it inside."
+            )
+        slope = 2 / (scaled.decoder.high - scaled.decoder.low) / (1 - unit.square())
+        (layer,) = (m for m in scaled.decoder.modules() if isinstance(m, nn.Linear))
+        with torch.no_grad():
+            layer.weight.copy_((directions * slope).mT)
+            layer.bias.copy_(unit.atanh())
+        return decoder
+
     def log_slope(self, synergy: Tensor) -> Tensor:
         """How far the action moves with the residual: ln |det ∂a/∂r| [*] at ``synergy`` [*, d+n].
 

@@ -8,44 +8,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_etl.functional import direction_bonus
+from torchrl_etl.modules.running_deviation import RunningDeviation
 from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
 __all__ = ["IntrinsicReward"]
-
-
-class _RunningDeviation(nn.Module):
-    """Exponentially weighted mean and variance of a scalar, free of start-up bias.
-
-    Weights are those of a bias-corrected moving average: the first update counts fully.
-    """
-
-    # A bonus that hardly varies is scaled up to ten times its root mean square, not to infinity.
-    _FLOOR = 0.1
-    _EPSILON = 1e-6
-
-    def __init__(self, decay: float) -> None:
-        super().__init__()
-        self.decay = decay
-        self.register_buffer("mean", torch.zeros(()))
-        # Never averaged in (the first update has full weight): it makes an unused divisor 1.
-        self.register_buffer("variance", torch.ones(()))
-        self.register_buffer("weight", torch.zeros(()))
-
-    def update(self, values: Tensor) -> None:
-        self.weight.mul_(self.decay).add_(1 - self.decay)
-        step = (1 - self.decay) / self.weight
-        change = values.mean() - self.mean
-        self.mean.add_(step * change)
-        between = step * change.square()
-        self.variance.add_(between).mul_(1 - step).add_(step * values.var(correction=0))
-
-    @property
-    def divisor(self) -> Tensor:
-        floor = self._FLOOR**2 * (self.variance + self.mean.square())
-        return torch.maximum(self.variance, floor).sqrt().clamp_min(self._EPSILON)
 
 
 class IntrinsicReward(TransitionReward):
@@ -164,8 +133,8 @@ class IntrinsicReward(TransitionReward):
         # Outside the module list: as a submodule the encoder would follow the env's device, be put
         # in eval mode under the learner's feet, and be saved twice.
         self.__dict__["_encoder"] = encoder
-        self.deviation = _RunningDeviation(decay) if normalize else None
-        self.reward_deviation = _RunningDeviation(decay) if normalize and extrinsic_weight else None
+        self.deviation = RunningDeviation(decay) if normalize else None
+        self.reward_deviation = RunningDeviation(decay) if normalize and extrinsic_weight else None
         self.extrinsic_weight = extrinsic_weight
         self.reward_key = unravel_key(reward_key)
         self.update_statistics = update_statistics
@@ -200,7 +169,7 @@ class IntrinsicReward(TransitionReward):
             bonus = bonus + self.extrinsic_weight * self._scaled(reward, self.reward_deviation)
         return (bonus,)
 
-    def _scaled(self, values: Tensor, deviation: _RunningDeviation | None) -> Tensor:
+    def _scaled(self, values: Tensor, deviation: RunningDeviation | None) -> Tensor:
         if deviation is None:
             return values
         if deviation.mean.device != values.device:

@@ -1,0 +1,120 @@
+"""How much of what synergies command turns joints; no learning, one CSV row a bundle.
+
+    python benchmarks/joint_effects.py runs/EXPLORED runs/OTHER --out docs/results/joint_effects.csv
+
+RUN is a run folder of ETL. Its bundle is asked for uniform coefficients, and the excitations that
+they decode to are laid beside the moment arms of its task: ``share``, ``chance`` and ``gain`` are
+those of :func:`~torchrl_etl.analysis.joint_effects`. The first run of a task brings three rows to
+compare with: uniform actions, as many random directions around the middle action, and the body's
+own synergies (``benchmarks/body_synergies.py``). Rows are appended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from body_synergies import body_decoder, muscle_changes
+from omegaconf import DictConfig
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_etl.analysis import joint_effects
+from torchrl_etl.command_line import one_sentence, quiet_torchrl
+from torchrl_etl.envs import excitation, joint_torques, make_env
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import load_bundle
+from torchrl_etl.training import resumed_config
+from torchrl_etl.training.run_folder import facts
+
+SAMPLES = 4096
+REST = 0.25
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--out", type=Path, required=True, help="CSV file to append to")
+    arguments = parser.parse_args()
+    quiet_torchrl()
+    tasks = known_tasks(arguments.out)
+    for run in arguments.runs:
+        with one_sentence(ValueError, OSError):
+            config = resumed_config(run)
+            for row in rows_of(run, config, with_references=config.env not in tasks):
+                append(arguments.out, row)
+                print(json.dumps(row), flush=True)
+        tasks.add(config.env)
+
+
+def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[dict[str, Any]]:
+    """One row of a run's bundle, after those that any bundle of its task is compared with."""
+    decoder, info = load_bundle(run, residual=0.0)
+    env = make_env(config.env, goal=config.goal, seed=0)
+    env.reset()
+    torques = joint_torques(env).matrix
+    actions = {}
+    if with_references:
+        actions |= references(env, torques, decoder.num_synergies)
+    actions["explored"] = decoded(decoder)
+    for name, chosen in actions.items():
+        effects = joint_effects(excitation(env, chosen), torques)
+        explored = name == "explored"
+        yield {
+            "task": config.env,
+            "synergies": name,
+            "extrinsic_weight": config.explore.bonus.extrinsic_weight if explored else "",
+            "seed": config.seed if explored else "",
+            "explored_frames": info.facts["frames"] if explored else "",
+            **{key: round(value, 4) for key, value in effects._asdict().items()},
+            "run_commit": info.facts["commit"] if explored else "",
+            **{key: facts()[key] for key in ("commit", "machine")},
+        }
+
+
+def references(env: EnvBase, torques: Any, num_synergies: int) -> dict[str, Tensor]:
+    """Actions [N, n] of no exploration."""
+    torch.manual_seed(0)
+    space = env.full_action_spec_unbatched["action"].space
+    middle, half = (space.high + space.low) / 2, (space.high - space.low) / 2
+    directions = half * torch.randn(num_synergies, len(half)) / num_synergies**0.5
+    random = SynergyDecoder.from_directions(middle, directions, low=space.low, high=space.high)
+    return {
+        "uniform_actions": middle + half * (2 * torch.rand(SAMPLES, len(half)) - 1),
+        "random_directions": decoded(random),
+        "body": decoded(body_decoder(env, muscle_changes(torques), REST)),
+    }
+
+
+@torch.no_grad()
+def decoded(decoder: SynergyDecoder) -> Tensor:
+    """What a decoder makes of uniform coefficients."""
+    generator = torch.Generator().manual_seed(0)
+    return decoder.module(2 * torch.rand(SAMPLES, decoder.num_synergies, generator=generator) - 1)
+
+
+def known_tasks(out: Path) -> set[str]:
+    if not out.exists():
+        return set()
+    with out.open(newline="", encoding="utf-8") as file:
+        return {row["task"] for row in csv.DictReader(file)}
+
+
+def append(out: Path, row: dict[str, Any]) -> None:
+    fresh = not out.exists()
+    with out.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, row, lineterminator="\n")
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+#!/bin/sh
+# Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles.
+#
+#     sh benchmarks/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
+#
+# One process after another, a thread each, two seeds; rows go to docs/results/kill_test. Kill it at
+# any time and start it again, here or on another machine: finished runs stay (the table alone is
+# enough), others go on from their checkpoints, and an oracle is made when what it needs is there.
+# It takes 1.5 to 2 hours a run on a free core with AVX2.
+set -e
+cd "$(dirname "$0")/.."
+task=${1:-myoLegWalk} frames=${2:-400000}
+python=${PYTHON:-.venv/bin/python}
+out=docs/results/kill_test
+export OMP_NUM_THREADS=1
+
+# An update per 8 frames, targets of three steps at a horizon of 50; the averaged actor spans as many
+# frames as by default. ETL explores for 20,000 frames with 5,000 updates.
+settings="learn.updates_per_frame=0.125 learn.learning_starts=5000 learn.buffer_size=400000
+  learn.sac.gamma=0.98 learn.sac.n_steps=3 learn.sac.actor_average=0.998
+  explore.frames=20000 explore.updates_per_frame=0.25
+  evaluation.every=25000 evaluation.episodes=5 checkpoint.every=50000 log_every=5000"
+
+queue() {
+  $python recipes/bench.py "tasks=[$task]" "methods=[$1]" 'seeds=[0,1]' frames="$frames" \
+    out=$out jobs=1 settings="$(echo $settings)"
+}
+
+queue sac
+queue etl
+[ -d "runs/oracles/body-$task" ] ||
+  $python benchmarks/body_synergies.py "$task" "runs/oracles/body-$task"
+queue etl_body
+learned=$out/$task-sac-seed0
+for model in gmvae pca; do
+  oracle=runs/oracles/learned_$model-$task
+  [ -d "$oracle" ] ||
+    $python benchmarks/learned_synergies.py "$learned" "$oracle" --model $model
+  queue etl_learned_$model
+done

@@ -1,0 +1,54 @@
+"""joint_effects, by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_etl.analysis import joint_effects
+
+# Two joints and four muscles: a pair of opponents at each.
+TORQUES = np.array([[3.0, -3.0, 0.0, 0.0], [0.0, 0.0, 0.5, -0.5]])
+
+
+def test_opposed_changes_turn_joints_and_common_ones_do_not():
+    opposed = np.array([[0.2, 0.0, 0.3, 0.1], [0.0, 0.2, 0.1, 0.3]])
+    common = np.array([[0.2, 0.2, 0.0, 0.0], [0.0, 0.0, 0.3, 0.3]])
+    assert joint_effects(opposed, TORQUES).share == pytest.approx(1.0)
+    assert joint_effects(common, TORQUES).share == pytest.approx(0.0)
+    assert joint_effects(common, TORQUES).gain == pytest.approx(0.0)
+
+
+def test_a_single_muscle_turns_its_joint_with_half_of_its_variance():
+    alone = np.array([[0.0, 0.4, 0.4, 0.4], [1.0, 0.4, 0.4, 0.4]])
+    effects = joint_effects(alone, TORQUES)
+    # Its direction (1, 0, 0, 0) has the share 1/2 along (1, -1, 0, 0) / √2. Rows of unit length
+    # have four entries of 1/√2, of which a muscle meets one: the torque variance of chance.
+    assert effects.share == pytest.approx(0.5)
+    assert effects.gain == pytest.approx(1.0)
+
+
+def test_independent_muscles_have_the_share_and_the_gain_of_chance():
+    noise = np.random.default_rng(0).uniform(size=(200_000, 4))
+    effects = joint_effects(noise, TORQUES)
+    assert effects.chance == 0.5
+    assert effects.share == pytest.approx(0.5, abs=0.005)
+    assert effects.gain == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_joint_that_repeats_another_does_not_raise_chance():
+    doubled = np.concatenate([TORQUES, 2 * TORQUES[:1]])
+    assert joint_effects(np.eye(4), doubled).chance == 0.5
+
+
+@pytest.mark.parametrize(
+    ("activations", "torques", "words"),
+    [
+        (np.eye(3), TORQUES, "activations of 3 muscles and torques of 4"),
+        (np.eye(4), np.zeros((1, 4)), "No muscle turns joint 0"),
+        (np.ones((5, 4)), TORQUES, "do not vary"),
+    ],
+)
+def test_what_does_not_fit_is_refused(activations, torques, words):
+    with pytest.raises(ValueError, match=words):
+        joint_effects(activations, torques)

@@ -1,0 +1,95 @@
+"""The scripts that lay synergies beside a body's moment arms."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from benchmarks.body_synergies import body_decoder, muscle_changes
+from tests.configs import ROOT, tiny
+from torchrl_etl.analysis import joint_effects
+from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import load_bundle, save_bundle
+
+TASK = "myoHandKeyTurn"
+
+
+def test_a_synergy_turns_its_joint_alone_and_its_strongest_muscle_changes_by_one():
+    # Two opponents at the first joint, and a muscle over both joints.
+    torques = np.array([[2.0, -2.0, 1.0], [0.0, 0.0, 3.0]])
+    changes = muscle_changes(torques)
+    turned = changes @ torques.T
+    assert turned[~np.eye(2, dtype=bool)] == pytest.approx(0.0, abs=1e-12)
+    assert (np.diag(turned) > 0).all()
+    # By hand: (1/2, -1/2, 0) turns the first joint; the second takes the third muscle, whose pull
+    # on the first the two opponents hold: (-1/4, 1/4, 1).
+    assert changes == pytest.approx(np.array([[1.0, -1.0, 0.0], [-0.25, 0.25, 1.0]]))
+
+
+def test_fewer_synergies_are_what_muscles_turn_most():
+    # The same two muscles turn the first two joints; a third turns the last.
+    torques = np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 0.0], [0.0, 0.0, 9.0]])
+    (change,) = muscle_changes(torques, 1)
+    assert np.abs(change) == pytest.approx([1.0, 1.0, 0.0])
+    with pytest.raises(ValueError, match="--num-synergies is 4, but muscles turn 3 joints"):
+        muscle_changes(torques, 4)
+
+
+def test_the_decoder_rests_where_it_is_told_and_moves_joints():
+    env = make_env(TASK, seed=0)
+    env.reset()
+    torques = joint_torques(env, num_postures=2).matrix
+    changes = muscle_changes(torques)
+    decoder = body_decoder(env, changes, rest=0.25)
+    at = torch.zeros(len(changes))
+    rested = excitation(env, decoder.module(at))
+    assert torch.allclose(rested, torch.full((39,), 0.25), atol=1e-5)
+    slope = torch.autograd.functional.jacobian(lambda u: excitation(env, decoder.module(u)), at)
+    assert torch.allclose(slope.mT, torch.from_numpy(changes).float(), atol=1e-4)
+    near = excitation(env, decoder.module(0.05 * torch.randn(500, len(changes)))).detach()
+    assert joint_effects(near, torques).share > 0.99
+    with pytest.raises(ValueError, match="no action inside the bounds makes that"):
+        body_decoder(env, changes, rest=0.95)
+
+
+def script(name, *arguments):
+    command = [sys.executable, str(ROOT / "benchmarks" / name), *map(str, arguments)]
+    environ = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, check=True, timeout=240, capture_output=True, env=environ)
+
+
+def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_path):
+    script("body_synergies.py", TASK, tmp_path / "body", "--num-synergies", 5)
+    decoder, info = load_bundle(tmp_path / "body")
+    assert decoder.num_synergies == 5
+    assert info.facts["joint_share"] > 0.8
+    assert list(info.actuators) == actuator_names(TASK)
+
+    run = tmp_path / "run"
+    random = SynergyDecoder(2, 39)
+    facts = {"frames": 7, "commit": "abc"}
+    save_bundle(random, run / "synergies", task=TASK, actuators=info.actuators, facts=facts)
+    config = tiny(f"env={TASK}", "seed=3", "explore.bonus.extrinsic_weight=1")
+    OmegaConf.save(config, run / "config.yaml")
+    script("joint_effects.py", run, "--out", tmp_path / "rows.csv")
+    script("joint_effects.py", run, "--out", tmp_path / "rows.csv")
+    with (tmp_path / "rows.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    kinds = ["uniform_actions", "random_directions", "body", "explored", "explored"]
+    assert [row["synergies"] for row in rows] == kinds
+    assert rows[3] == rows[4]
+    assert (rows[3]["extrinsic_weight"], rows[3]["seed"], rows[3]["run_commit"]) == (
+        "1",
+        "3",
+        "abc",
+    )
+    assert float(rows[0]["share"]) == pytest.approx(float(rows[0]["chance"]), abs=0.03)
+    assert float(rows[2]["share"]) > 0.9

@@ -1,0 +1,78 @@
+"""How much of what muscles do turns joints: activations beside the body's moment arms."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from torchrl_etl.analysis.diagnostics import as_matrix
+
+__all__ = ["JointEffects", "joint_effects"]
+
+
+class JointEffects(NamedTuple):
+    """What :func:`joint_effects` returns."""
+
+    share: float
+    chance: float
+    gain: float
+
+
+def joint_effects(activations: Tensor | ArrayLike, torques: Tensor | ArrayLike) -> JointEffects:
+    """Where the variance of muscle activations lies, as joints see it.
+
+    A change of activations outside of the row space of the torques moves no joint: the muscles that
+    change cancel out.
+
+    Equation: with Σ the covariance of the activations, M the torques with rows of unit length and
+    P the projector on their row space, share = tr(PΣ) / tr(Σ) and
+    gain = (tr(MΣMᵀ) / tr(Σ)) / (tr(MMᵀ) / n).
+
+    Args:
+        activations (Tensor or array): [*, n].
+        torques (Tensor or array): torque on each of J joints of each fully active muscle [J, n],
+            as :func:`~torchrl_etl.envs.joint_torques` gives them.
+
+    Returns:
+        JointEffects: ``share``, the part of the variance that turns joints, in [0, 1]; ``chance``,
+        what it is for independent muscles of the same variance, rank(M) / n; ``gain``, the torque
+        variance that a unit of activation variance gives, 1 for those independent muscles.
+
+    Raises:
+        ValueError: if the numbers of muscles differ, a joint has no torque, or activations do not
+            vary.
+
+    Examples:
+        >>> import numpy as np
+        >>> flexor_and_extensor = np.array([[1.0, -1.0]])  # of one joint
+        >>> effects = joint_effects([[0.0, 1.0], [1.0, 0.0]], flexor_and_extensor)  # in turn
+        >>> round(effects.share, 6), effects.chance, round(effects.gain, 6)
+        (1.0, 0.5, 2.0)
+        >>> joint_effects([[0.0, 0.0], [1.0, 1.0]], flexor_and_extensor).share  # both at once
+        0.0
+    """
+    activations, torques = as_matrix(activations, "activations"), as_matrix(torques, "torques")
+    if activations.shape[1] != torques.shape[1]:
+        raise ValueError(
+            f"There are activations of {activations.shape[1]} muscles and torques of "
+            f"{torques.shape[1]}; both must be of the same body."
+        )
+    sizes = np.linalg.norm(torques, axis=1, keepdims=True)
+    if not sizes.all():
+        raise ValueError(
+            f"No muscle turns joint {int(np.flatnonzero(sizes == 0)[0])}; leave its row out."
+        )
+    changes = activations - activations.mean(0)
+    total = np.square(changes).sum()
+    if total <= 1e-24 * np.square(activations).sum():
+        raise ValueError("The activations do not vary; pass those of several coefficients.")
+    unit = torques / sizes
+    _, values, rows = np.linalg.svd(unit, full_matrices=False)
+    rows = rows[values > 1e-6 * values[0]]
+    muscles = unit.shape[1]
+    share = np.square(changes @ rows.T).sum() / total
+    gain = np.square(changes @ unit.T).sum() / total * muscles / np.square(unit).sum()
+    return JointEffects(float(share), len(rows) / muscles, float(gain))

@@ -1,0 +1,125 @@
+"""What the muscles of a body do to its joints, read from the MuJoCo model."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_etl.envs.simulator import mujoco_state, simulator
+
+__all__ = ["JointTorques", "excitation", "joint_torques"]
+
+
+class JointTorques(NamedTuple):
+    """Names of J joints, and the torque on each of a fully active muscle [J, n], in N·m (or N)."""
+
+    joints: tuple[str, ...]
+    matrix: np.ndarray
+
+
+def joint_torques(
+    env: EnvBase, *, num_postures: int = 32, spread: float = 0.25, seed: int = 0
+) -> JointTorques:
+    """Moment arms times peak forces: the torque that each muscle adds to each joint.
+
+    It is the mean over the posture after a reset and others near it, at rest: every joint is moved
+    by up to half of ``spread`` times its range to either side. Active forces alone count, not those
+    of stretched muscles. A joint that an equality ties to another one (the sliding parts of a knee)
+    adds its torque to that one's, by the ratio in which the two move. Joints that no muscle spans
+    are left out.
+
+    Args:
+        env (EnvBase): an environment on a MuJoCo model all of whose actuators are muscles.
+
+    Keyword Args:
+        num_postures (int): postures in all. Default: 32.
+        spread (float): share of each joint's range in which they lie. Default: 0.25.
+        seed (int): of the postures. Default: 0.
+
+    Returns:
+        JointTorques: rows in the model's order of joints, columns in that of the action.
+
+    Raises:
+        ValueError: if there is no MuJoCo model, or one with other actuators than muscles.
+
+    Examples:
+        >>> from torchrl_etl.envs import joint_torques, make_env
+        >>> torques = joint_torques(make_env("myoHandKeyTurn", seed=0), num_postures=2)
+        >>> torques.matrix.shape  # 23 joints, 39 muscles
+        (23, 39)
+    """
+    model, now = mujoco_state(env)
+    if model.na != model.nu or (model.actuator_dyntype != mujoco.mjtDyn.mjDYN_MUSCLE).any():
+        raise ValueError(
+            f"{model.nu} actuators with {model.na} activations came, and not all are muscles; "
+            "joint torques per activation need a body that is moved by muscles alone."
+        )
+    data, generator = mujoco.MjData(model), np.random.default_rng(seed)
+    simple = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    limited = np.flatnonzero(simple & model.jnt_limited.astype(bool))
+    span = spread * np.ptp(model.jnt_range[limited], axis=1)
+    total = np.zeros((model.njnt, model.nu))
+    for posture in range(num_postures):
+        data.qpos[:] = now.qpos
+        if posture:
+            places = model.jnt_qposadr[limited]
+            moved = data.qpos[places] + span * generator.uniform(-0.5, 0.5, len(limited))
+            data.qpos[places] = moved.clip(*model.jnt_range[limited].T)
+        total[simple] += _tied(model, data) @ _active_torques(model, data, simple)
+    mean = total / num_postures
+    moved = np.abs(mean).max(1) > 1e-6 * np.abs(mean).max()
+    names = tuple(model.joint(int(joint)).name for joint in np.flatnonzero(moved))
+    return JointTorques(names, mean[moved])
+
+
+def excitation(env: EnvBase, action: Tensor) -> Tensor:
+    """The excitations in [0, 1] that MyoSuite makes of actions [*, n], its sigmoid or themselves.
+
+    Held, an excitation is what the activation of a muscle comes to.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.envs import excitation, make_env
+        >>> excitation(make_env("myoHandKeyTurn"), torch.tensor([-1.0, 0.5])).tolist()
+        [0.0005..., 0.5]
+    """
+    bounds = simulator(env).action_space
+    if (bounds.low == -1).all() and (bounds.high == 1).all():
+        return (5.0 * (action - 0.5)).sigmoid()
+    return action
+
+
+def _active_torques(model: Any, data: Any, simple: np.ndarray) -> np.ndarray:
+    """Of each muscle alone on each hinge or slide in one posture [J, n], less what is passive."""
+    torques = []
+    data.qvel[:] = 0.0
+    for activation in (np.zeros(model.na), *np.eye(model.na)):
+        data.act[model.actuator_actadr] = activation
+        mujoco.mj_forward(model, data)
+        torques.append(data.qfrc_actuator[model.jnt_dofadr[simple]].copy())
+    return (np.array(torques[1:]) - torques[0]).T
+
+
+def _tied(model: Any, data: Any) -> np.ndarray:
+    """How far each hinge or slide moves with each [J, J], as rows of those that are free.
+
+    Brings the tied ones in ``data`` to where their equalities want them.
+    """
+    moves = np.eye(model.njnt)
+    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        tied, free = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        if not data.eq_active[equality]:
+            continue
+        polynomial = np.polynomial.Polynomial(model.eq_data[equality, :5])
+        moves[tied, tied] = 0.0
+        at, start = model.jnt_qposadr, model.qpos0
+        offset = 0.0 if free < 0 else data.qpos[at[free]] - start[at[free]]
+        data.qpos[at[tied]] = start[at[tied]] + polynomial(offset)
+        if free >= 0:
+            moves[free, tied] = polynomial.deriv()(offset)
+    simple = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    return moves[np.ix_(simple, simple)]

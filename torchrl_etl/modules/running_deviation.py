@@ -1,0 +1,56 @@
+"""Mean and deviation of a scalar that drifts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["RunningDeviation"]
+
+
+class RunningDeviation(nn.Module):
+    """Exponentially weighted mean and variance of a scalar, free of start-up bias.
+
+    Weights are those of a bias-corrected moving average: the first update counts fully.
+
+    Args:
+        decay (float): in (0, 1); an update weighs ``1 - decay``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.modules.running_deviation import RunningDeviation
+        >>> deviation = RunningDeviation(decay=0.9)
+        >>> deviation.update(torch.tensor([1.0, 5.0]))
+        >>> deviation.divisor
+        tensor(2.)
+    """
+
+    # What hardly varies is scaled up to ten times its root mean square, not to infinity.
+    _FLOOR = 0.1
+    _EPSILON = 1e-6
+
+    def __init__(self, decay: float) -> None:
+        super().__init__()
+        if not 0.0 < decay < 1.0:
+            raise ValueError(f"decay is {decay}; it must lie strictly between 0 and 1.")
+        self.decay = decay
+        self.register_buffer("mean", torch.zeros(()))
+        # Never averaged in (the first update has full weight): it makes an unused divisor 1.
+        self.register_buffer("variance", torch.ones(()))
+        self.register_buffer("weight", torch.zeros(()))
+
+    def update(self, values: Tensor) -> None:
+        if self.mean.device != values.device:
+            self.to(values.device)
+        self.weight.mul_(self.decay).add_(1 - self.decay)
+        step = (1 - self.decay) / self.weight
+        change = values.mean() - self.mean
+        self.mean.add_(step * change)
+        between = step * change.square()
+        self.variance.add_(between).mul_(1 - step).add_(step * values.var(correction=0))
+
+    @property
+    def divisor(self) -> Tensor:
+        """The deviation, at least a tenth of the root mean square; 1 before the first update."""
+        floor = self._FLOOR**2 * (self.variance + self.mean.square())
+        return torch.maximum(self.variance, floor).sqrt().clamp_min(self._EPSILON)

@@ -1,0 +1,73 @@
+"""Uniform actions at the beginning of a run."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+__all__ = ["UniformWarmup"]
+
+
+class UniformWarmup(TensorDictModuleBase):
+    """Replaces a policy's actions by uniform ones for the first so many.
+
+    It goes behind the actor: ``TensorDictSequential(actor, UniformWarmup(action_spec, 10_000))``.
+    The ``init_random_frames`` of TorchRL's collectors draws what the *environment* takes and begins
+    again when a run is resumed; this draws what the *actor* emits (synergies too) and its count can
+    be set. The count is in neither the tensordict nor the ``state_dict()``: pushing weights to a
+    worker leaves it alone. Where exploration is not set to random, actions pass uncounted.
+
+    Args:
+        action_spec (Bounded): what the actor emits, unbatched.
+        frames (int): actions to replace, those of all rows counted.
+
+    Keyword Args:
+        action_key (NestedKey): Default: ``"action"``.
+
+    Keys:
+        reads and writes ``action`` [*, n], within the bounds of the spec.
+
+    Raises:
+        ValueError: if frames is negative.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.envs import ExplorationType, set_exploration_type
+        >>> from torchrl_etl.modules import UniformWarmup
+        >>> warmup = UniformWarmup(Bounded(0, 1, shape=(2,)), frames=3)
+        >>> data = TensorDict({"action": torch.full((3, 2), 7.0)}, [3])
+        >>> with set_exploration_type(ExplorationType.RANDOM):
+        ...     first, second = warmup(data.clone())["action"], warmup(data.clone())["action"]
+        >>> bool((first <= 1).all()), bool((second == 7).all())
+        (True, True)
+    """
+
+    seen: int
+    """Actions so far. Set it to go on where another run ended."""
+
+    def __init__(
+        self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"
+    ) -> None:
+        if frames < 0:
+            raise ValueError(f"frames is {frames}; it is a number of actions, 0 or more.")
+        super().__init__()
+        self.frames, self.seen = frames, 0
+        self.action_key = unravel_key(action_key)
+        self.in_keys = self.out_keys = [self.action_key]
+        self.register_buffer("low", action_spec.space.low.clone(), persistent=False)
+        self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if exploration_type() is not ExplorationType.RANDOM or self.seen >= self.frames:
+            return tensordict
+        action = tensordict.get(self.action_key)
+        self.seen += action.shape[:-1].numel()
+        uniform = self.low + torch.rand_like(action) * (self.high - self.low)
+        return tensordict.set(self.action_key, uniform.to(action))
