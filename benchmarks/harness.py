@@ -21,7 +21,7 @@ __all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy"]
 
 CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
-PLAIN = ("learner=plain", "num_synergies=4", "learn.residual=0")
+PLAIN = ("learner=plain", "num_synergies=4", "learn.decoder.residual=0")
 
 
 def recipe(*overrides: str) -> DictConfig:

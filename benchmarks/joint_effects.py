@@ -70,7 +70,7 @@ def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[di
         yield {
             "task": config.env,
             "synergies": name,
-            "extrinsic_weight": config.explore.bonus.extrinsic_weight if explored else "",
+            "extrinsic_weight": config.exploration.bonus.extrinsic_weight if explored else "",
             "seed": config.seed if explored else "",
             "explored_frames": info.facts["frames"] if explored else "",
             **{key: round(value, 4) for key, value in effects._asdict().items()},

@@ -16,9 +16,9 @@ export OMP_NUM_THREADS=1
 
 # An update per 8 frames, targets of three steps at a horizon of 50; the averaged actor spans as many
 # frames as by default. ETL explores for 20,000 frames with 5,000 updates.
-settings="learn.updates_per_frame=0.125 learn.learning_starts=5000 learn.buffer_size=400000
-  learn.sac.gamma=0.98 learn.sac.n_steps=3 learn.sac.actor_average=0.998
-  explore.frames=20000 explore.updates_per_frame=0.25
+settings="learn.replay_ratio=0.125 learn.learning_starts=5000 learn.buffer_size=400000
+  learn.sac.gamma=0.98 learn.n_steps=3 learn.sac.ema_decay=0.998
+  explore.frames=20000 explore.replay_ratio=0.25
   evaluation.every=25000 evaluation.episodes=5 checkpoint.every=50000 log_every=5000"
 
 queue() {

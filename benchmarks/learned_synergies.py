@@ -20,10 +20,10 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_etl.analysis import pca_vaf, variance_accounted_for
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.bundle import save_bundle
 from torchrl_etl.synergies import fit_gmvae
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
@@ -95,7 +95,9 @@ def main() -> None:
     print(json.dumps(known))
 
 
-def principal_directions(actions: Tensor, num_synergies: int, spec: EnvironmentSpec) -> SynergyDecoder:
+def principal_directions(
+    actions: Tensor, num_synergies: int, spec: EnvironmentSpec
+) -> SynergyDecoder:
     """The mean action, and the directions in which actions vary most, before the bounds.
 
     As with a GMVAE the box of coefficients spans the 1st to the 99th percentile of each.

@@ -22,13 +22,13 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import ExplorationType, set_exploration_type
-from torchrl_etl.training.stage import Stage
 
 from torchrl_etl.command_line import one_sentence
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.stage import Stage
 
 OBSERVATIONS, NEWEST, DRAWS = 1000, 4000, 20
 UPDATES = (10, 50, 200, 1000)

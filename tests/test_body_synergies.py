@@ -77,7 +77,7 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
     random = SynergyDecoder(2, 39)
     facts = {"frames": 7, "commit": "abc"}
     save_bundle(random, run / "synergies", task=TASK, actuators=info.actuators, facts=facts)
-    config = tiny(f"env={TASK}", "seed=3", "explore.bonus.extrinsic_weight=1")
+    config = tiny(f"env={TASK}", "seed=3", "exploration.bonus.extrinsic_weight=1")
     OmegaConf.save(config, run / "config.yaml")
     script("joint_effects.py", run, "--out", tmp_path / "rows.csv")
     script("joint_effects.py", run, "--out", tmp_path / "rows.csv")

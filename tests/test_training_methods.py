@@ -16,9 +16,9 @@ from tests.test_training_resume import numbers
 from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.sar import finished_episodes, rollouts
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.methods.sar import finished_episodes, rollouts
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
@@ -255,19 +255,31 @@ def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
 
 
 def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
-    sar = Experiment(config("sar", tmp_path / "run", "learn.sac.normalize_observations=true")).method
+    sar = Experiment(
+        config("sar", tmp_path / "run", "learn.sac.normalize_observations=true")
+    ).method
     play = sar.play_stage()
     play.restart_collection()
     seen = play.collect()["next", "episode_reward"].clone()
     before = {key: value.clone() for key, value in play.learner.actor.state_dict().items()}
-    norm, frames, kept = play.learner.objective.normalizer.count.clone(), play.frames, len(play.buffer)
+    norm, frames, kept = (
+        play.learner.objective.normalizer.count.clone(),
+        play.frames,
+        len(play.buffer),
+    )
     checks = []
     rows = rollouts(play, 400, lambda: checks.append(None))
     assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
     assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
     assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
-    assert (play.frames, len(play.buffer), play.learner.objective.normalizer.count) == (frames, kept, norm)
-    assert all(torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items())
+    assert (play.frames, len(play.buffer), play.learner.objective.normalizer.count) == (
+        frames,
+        kept,
+        norm,
+    )
+    assert all(
+        torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items()
+    )
 
 
 @pytest.mark.slow

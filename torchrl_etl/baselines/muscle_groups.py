@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, step_mdp
 
-from torchrl_etl.envs import body_joints, mujoco_state
 from torchrl_etl.checks import check_positive
+from torchrl_etl.envs import body_joints, mujoco_state
 
 __all__ = ["group_muscles", "record_muscle_lengths"]
 

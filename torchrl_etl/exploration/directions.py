@@ -66,12 +66,6 @@ class DirectionExploration(Exploration):
     def batch_transforms(self) -> Sequence[Transform]:
         return self._batch_transforms
 
-    def describe(self, rows: TensorDictBase) -> dict[str, Any]:
-        """``direction_alignment``: how far the states reached lie along the directions followed."""
-        from torchrl_etl.analysis import direction_alignment
-
-        return {"direction_alignment": direction_alignment(*self.embed(rows["next"]))}
-
     @torch.no_grad()
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:
         device = next(self.encoder.parameters()).device

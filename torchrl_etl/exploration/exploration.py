@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -54,10 +54,6 @@ class Exploration:
         """The policy that collects."""
         return actor
 
-    def describe(self, rows: TensorDictBase) -> dict[str, Any]:
-        """Facts about what was explored, for the bundle; ``rows`` are the latest transitions."""
-        return {}
-
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor] | None:
-        """Embeddings [*, k] and directions [*, k] of transitions, for a picture, if it has them."""
+        """Embeddings [*, k] and directions [*, k] of observations, if it has any."""
         return None

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
-from torchrl_etl.analysis import describe_synergies
+from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
@@ -175,7 +175,9 @@ class ETL(Method):
         context.run_stage(stage, stop)
         decoder = explorer.condense(stop.check)
         numbers, warnings = describe_synergies(explorer.model, decoder, explorer.actions())
-        numbers |= {**explorer.exploration.describe(stage.newest(20_000)), "frames": stage.frames}
+        if (embedded := explorer.exploration.embed(stage.newest(20_000)["next"])) is not None:
+            numbers["direction_alignment"] = direction_alignment(*embedded)
+        numbers["frames"] = stage.frames
         for warning in warnings:
             context.say(f"Warning: {warning}")
         if context.config.pictures:

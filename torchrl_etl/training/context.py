@@ -84,9 +84,7 @@ class Context:
             check_integer(0, init_random_frames=random)
         configured["init_random_actions"] = self.actions(random)
         with naming(section):
-            return build_learner(
-                spec.observation_dim, spec.action_spec, **{**configured, **parts}
-            )
+            return build_learner(spec.observation_dim, spec.action_spec, **{**configured, **parts})
 
     def stage(
         self,
