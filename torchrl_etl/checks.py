@@ -8,9 +8,18 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-__all__ = ["check_choice", "check_flag", "check_integer", "check_positive", "check_real"]
+__all__ = [
+    "check_choice",
+    "check_flag",
+    "check_integer",
+    "check_positive",
+    "check_real",
+    "check_sizes",
+    "naming",
+]
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
@@ -84,6 +93,42 @@ def check_real(interval: str, **values: object) -> None:
         if not within:
             words = {"(0, inf)": "above 0", "[0, inf)": "0 or more"}.get(interval, f"in {interval}")
             raise ValueError(f"{name} is {value!r}; it must be a number {words}.")
+
+
+def check_sizes(**values: object) -> None:
+    """Raise a ``ValueError`` naming the first value that is not a list of positive integers.
+
+    Examples:
+        >>> check_sizes(hidden=[64, 0])
+        Traceback (most recent call last):
+        ...
+        ValueError: hidden is [64, 0]; it must be a list of whole numbers above 0.
+    """
+    for name, value in values.items():
+        if (
+            not isinstance(value, Sequence)
+            or isinstance(value, str)
+            or not value
+            or not all(_is_integer(size) and size > 0 for size in value)
+        ):
+            raise ValueError(f"{name} is {value!r}; it must be a list of whole numbers above 0.")
+
+
+@contextmanager
+def naming(section: str) -> Iterator[None]:
+    """Put the section of a configuration before what a check of an argument says.
+
+    Examples:
+        >>> with naming("learn.sac"):
+        ...     check_real("(0, inf)", lr=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: learn.sac.lr is 0; it must be a number above 0.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise type(error)(f"{section}.{error}") from error
 
 
 def check_flag(**values: object) -> None:

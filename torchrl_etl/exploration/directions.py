@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.modules import StateEncoder
 from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, RedrawDirection
@@ -52,6 +53,7 @@ class DirectionExploration(Exploration):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
+        check_real("[0, 1]", relabel=relabel)
         self.encoder = StateEncoder(observation_dim, **encoder).to(device)
         self.inputs = {"direction": self.encoder.embedding_dim}
         self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
 from torchrl_etl.objectives import METRALoss
@@ -30,6 +31,7 @@ class METRAExploration(DirectionExploration):
         self, observation_dim: int, *, lr: float, metra: Mapping[str, Any], **directions: Any
     ) -> None:
         super().__init__(observation_dim, **directions)
+        check_real("(0, inf)", lr=lr)
         self._lr, self._metra = lr, dict(metra)
 
     def terms(self) -> Sequence[Term]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from torchrl_etl.checks import check_flag, check_real
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import GaussianDynamics
@@ -38,6 +39,9 @@ class MetricExploration(DirectionExploration):
         **directions: Any,
     ) -> None:
         super().__init__(observation_dim, **directions)
+        check_real("(0, inf)", lr=lr)
+        check_real("(0, 1]", tau=tau)
+        check_flag(**{"metric.delay_encoder": metric.get("delay_encoder", True)})
         self._lr, self._tau, self._metric = lr, tau, dict(metric)
 
     def terms(self) -> Sequence[Term]:

@@ -13,7 +13,7 @@ from tensordict.nn import (
 )
 from torchrl.data import Bounded
 
-from torchrl_etl.checks import check_choice, check_flag
+from torchrl_etl.checks import check_choice, check_flag, naming
 from torchrl_etl.learners.objective import NORMALIZED
 from torchrl_etl.learners.sac import SACLearner, entropy_target
 from torchrl_etl.modules import (
@@ -79,34 +79,40 @@ def build_learner(
         ValueError: naming the argument that cannot be used.
     """
     sac, noise, device = dict(sac), dict(noise), action_spec.device
-    check_choice("noise.kind", kind := noise.pop("kind"), get_args(Noise))
-    check_flag(**{"sac.normalize_observations": (norm := sac.pop("normalize_observations"))})
+    with naming("noise"):
+        check_choice("kind", kind := noise.pop("kind"), get_args(Noise))
+    with naming("sac"):
+        check_flag(normalize_observations=(norm := sac.pop("normalize_observations")))
     normalizer = RunningNorm(observation_dim).to(device) if norm else None
     inputs = {NORMALIZED if norm else "observation": observation_dim, **(inputs or {})}
     if decoder is None:
         emitted, out_key = action_spec, "action"
     else:
         emitted, out_key = decoder.to(device).synergy_spec, decoder.in_keys[0]
-    policy = make_actor(inputs, emitted, out_key=out_key, **actor).to(device)
-    value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
-    if make_behavior is None:
-        behavior = HeldNoise(policy, **noise) if kind == "held" else policy
-    else:
+    with naming("actor"):
+        policy = make_actor(inputs, emitted, out_key=out_key, **actor).to(device)
+    with naming("critic"):
+        value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
+    if make_behavior is not None:
         behavior = make_behavior(policy)
+    else:
+        with naming("noise"):
+            behavior = HeldNoise(policy, **noise) if kind == "held" else policy
     behavior, options = wrap(behavior), dict(more(policy))
     if init_random_actions:
         warmup = UniformWarmup(emitted, init_random_actions, action_key=out_key)
         behavior = TensorDictSequential(behavior, warmup)
         options["on_restart"] = [*options.get("on_restart", ()), partial(setattr, warmup, "seen")]
-    return SACLearner(
-        policy,
-        value,
-        action_spec=emitted,
-        decoder=decoder,
-        behavior=behavior,
-        normalizer=normalizer,
-        target_entropy=entropy(emitted, sac.pop("action_std")),
-        bins=critic.get("bins", 1),
-        **sac,
-        **options,
-    )
+    with naming("sac"):
+        return SACLearner(
+            policy,
+            value,
+            action_spec=emitted,
+            decoder=decoder,
+            behavior=behavior,
+            normalizer=normalizer,
+            target_entropy=entropy(emitted, sac.pop("action_std")),
+            bins=critic.get("bins", 1),
+            **sac,
+            **options,
+        )

@@ -20,6 +20,7 @@ from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Bounded
 
+from torchrl_etl.checks import check_flag, check_positive, check_real
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import warmed_up_ema
 from torchrl_etl.learners.objective import NORMALIZED, Objective
@@ -110,6 +111,14 @@ class SACLearner:
         on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
     ) -> None:
+        check_real("[0, 1)", gamma=gamma, ema_decay=ema_decay)
+        check_real("(0, 1]", tau=tau)
+        check_real("[0, 1]", lr_end=lr_end)
+        check_real("(0, inf)", lr=lr, alpha_init=alpha_init)
+        check_positive(num_critics=num_critics, bins=bins)
+        check_flag(unit_rows=unit_rows)
+        if return_bound is not None:
+            check_real("(0, inf)", return_bound=return_bound)
         self.gamma, self.lr_end, self.device = gamma, lr_end, next(actor.parameters()).device
         self.on_frames, self.on_restart = on_frames, on_restart
         options: dict[str, Any] = {
@@ -237,6 +246,7 @@ def entropy_target(action_spec: Bounded, action_std: float | None) -> float | Li
     """
     if action_std is None:
         return "auto"
+    check_real("(0, inf)", action_std=action_std)
     half_range = (action_spec.space.high - action_spec.space.low) / 2
     return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from torchrl_etl.analysis import describe_synergies, direction_alignment
-from torchrl_etl.checks import check_choice, check_real
+from torchrl_etl.checks import check_choice, check_real, naming
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
 from torchrl_etl.io import surviving_folder, write_atomically
@@ -20,7 +20,7 @@ from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
-from torchrl_etl.training.context import Context, naming
+from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_flag, check_sizes
 
 __all__ = ["Body", "actor_with", "make_actor", "make_critic", "make_layers", "start_small"]
 
@@ -62,6 +62,8 @@ def make_layers(
 ) -> nn.Sequential:
     """The layers of an actor or a critic; called with as many tensors as it has inputs."""
     check_choice("body", body, get_args(Body))
+    check_sizes(hidden=hidden)
+    check_flag(layer_norm=layer_norm)
     if body != "mlp":
         if len(set(hidden)) != 1:
             raise ValueError(

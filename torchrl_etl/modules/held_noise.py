@@ -9,6 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_etl.checks import check_positive, check_real
+
 __all__ = ["HeldNoise"]
 
 
@@ -58,10 +60,8 @@ class HeldNoise(TensorDictModuleBase):
         longest: int = 16,
         init_key: NestedKey = "is_init",
     ) -> None:
-        if not exponent > 0:
-            raise ValueError(f"exponent is {exponent}; it must be above 0.")
-        if longest < 1:
-            raise ValueError(f"longest is {longest}; it is a number of steps and must be positive.")
+        check_real("(0, inf)", exponent=exponent)
+        check_positive(longest=longest)
         super().__init__()
         self.actor, self.init_key = actor, init_key
         self.in_keys = [*actor.in_keys, init_key]

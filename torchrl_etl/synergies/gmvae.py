@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_etl.checks import check_real, check_sizes
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.objectives import GMVAELoss
 from torchrl_etl.synergies.model import SynergyModel
@@ -45,6 +46,9 @@ class GMVAESynergies(SynergyModel):
         component_kl_weight: float = 1.0,
         updates: int = 2000,
     ) -> None:
+        check_real("(0, inf)", lr=lr)
+        check_real("[0, inf)", kl_weight=kl_weight, component_kl_weight=component_kl_weight)
+        check_sizes(hidden=hidden)
         self.num_synergies, self.lr, self._updates = num_synergies, lr, updates
         self.model = GMVAE(
             len(low),

@@ -9,7 +9,13 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real
+from torchrl_etl.checks import (
+    check_choice,
+    check_flag,
+    check_integer,
+    check_real,
+    check_sizes,
+)
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 
@@ -97,6 +103,7 @@ def validate(config: DictConfig) -> None:
             )
         },
     )
+    check_sizes(**{"vaf_curve.dims": config.vaf_curve.dims})
     check_integer(2, **{"checkpoint.keep": config.checkpoint.keep})
     check_integer(0, **{"explore.fit.final_updates": config.explore.fit.final_updates})
     check_real("(0, inf)", **{"collector.timeout": config.collector.timeout})

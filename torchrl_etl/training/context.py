@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -14,7 +13,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_integer, naming
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.learners import SACLearner, build_learner
@@ -22,7 +21,7 @@ from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage, frames_per_action
 
-__all__ = ["Context", "naming"]
+__all__ = ["Context"]
 
 NOT_OF_THE_STAGE = ("actor", "critic", "sac", "noise", "init_random_frames")  # the learner's
 NOT_OF_THE_STAGE += ("decoder", "prefill", "fit")  # the method's
@@ -160,23 +159,6 @@ class Context:
 def stage_seed(seed: int, section: str) -> int:
     """Seeds of the two stages never meet."""
     return 2 * seed + (section != "explore")
-
-
-@contextmanager
-def naming(section: str) -> Iterator[None]:
-    """Put the section of the configuration before what an argument check says.
-
-    Examples:
-        >>> with naming("learn.sac"):
-        ...     raise ValueError("lr is 0; it must be a number above 0.")
-        Traceback (most recent call last):
-        ...
-        ValueError: learn.sac.lr is 0; it must be a number above 0.
-    """
-    try:
-        yield
-    except ValueError as error:
-        raise type(error)(f"{section}.{error}") from error
 
 
 def env_of_a_collector(name: str, transforms: Sequence[Transform], **kwargs: Any) -> TransformedEnv:
