@@ -24,7 +24,7 @@ from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.atomic_files import surviving_folder, write_atomically
 from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.training.config import validate
+from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.explore import ExploreStage
 from torchrl_etl.training.learn import LearnStage
@@ -81,6 +81,8 @@ class Experiment:
                 f"{len(self.actuators)} actuators; choose at most that many."
             )
         self._build_once()
+        if warning := bfloat16_warning(self.config):
+            self.say(f"Warning: {warning}")
         self.resume = resume is not None
         self.folder = RunFolder(self.path, self.config)
 
