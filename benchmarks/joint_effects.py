@@ -4,9 +4,11 @@
 
 RUN is a run folder of ETL. Its bundle is asked for uniform coefficients, and the excitations that
 they decode to are laid beside the moment arms of its task: ``share``, ``chance`` and ``gain`` are
-those of :func:`~torchrl_etl.analysis.joint_effects`. The first run of a task brings three rows to
-compare with: uniform actions, as many random directions around the middle action, and the body's
-own synergies (``benchmarks/body_synergies.py``). Rows are appended.
+those of :func:`~torchrl_etl.analysis.joint_effects`. ``shuffled`` is the mean share, and
+``shuffled_sd`` its standard deviation, when muscles change places at random: what a share must
+leave to say anything. The first run of a task brings three rows to compare with: uniform actions,
+as many random directions around the middle action, and the body's own synergies
+(``benchmarks/body_synergies.py``). Rows are appended.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from body_synergies import body_decoder, muscle_changes
 from omegaconf import DictConfig
@@ -32,7 +35,7 @@ from torchrl_etl.modules.bundle import load_bundle
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
 
-SAMPLES = 4096
+SAMPLES, SHUFFLES = 4096, 100
 REST = 0.25
 
 
@@ -65,7 +68,8 @@ def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[di
         actions |= references(env, torques, decoder.num_synergies)
     actions["explored"] = decoded(decoder)
     for name, chosen in actions.items():
-        effects = joint_effects(excitation(env, chosen), torques)
+        excitations = excitation(env, chosen)
+        effects = joint_effects(excitations, torques)._asdict() | shuffled(excitations, torques)
         explored = name == "explored"
         yield {
             "task": config.env,
@@ -73,13 +77,13 @@ def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[di
             "extrinsic_weight": config.exploration.bonus.extrinsic_weight if explored else "",
             "seed": config.seed if explored else "",
             "explored_frames": info.facts["frames"] if explored else "",
-            **{key: round(value, 4) for key, value in effects._asdict().items()},
+            **{key: round(value, 4) for key, value in effects.items()},
             "run_commit": info.facts["commit"] if explored else "",
             **{key: facts()[key] for key in ("commit", "machine")},
         }
 
 
-def references(env: EnvBase, torques: Any, num_synergies: int) -> dict[str, Tensor]:
+def references(env: EnvBase, torques: np.ndarray, num_synergies: int) -> dict[str, Tensor]:
     """Actions [N, n] of no exploration."""
     torch.manual_seed(0)
     space = env.full_action_spec_unbatched["action"].space
@@ -91,6 +95,14 @@ def references(env: EnvBase, torques: Any, num_synergies: int) -> dict[str, Tens
         "random_directions": decoded(random),
         "body": decoded(body_decoder(env, muscle_changes(torques), REST)),
     }
+
+
+def shuffled(excitations: Tensor, torques: np.ndarray) -> dict[str, float]:
+    """The share of the same excitations [N, n] with their muscles in another order."""
+    generator = torch.Generator().manual_seed(0)
+    orders = [torch.randperm(torques.shape[1], generator=generator) for _ in range(SHUFFLES)]
+    shares = [joint_effects(excitations[:, order], torques).share for order in orders]
+    return {"shuffled": float(np.mean(shares)), "shuffled_sd": float(np.std(shares))}
 
 
 @torch.no_grad()

@@ -32,11 +32,14 @@ class PointEnv(EnvBase):
         nested: bool = False,
         low: float = -1.0,
         high: float = 1.0,
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(batch_size=torch.Size(batch_size), device="cpu")
         self.prefix = ("agent",) if nested else ()
         shape = self.batch_size
-        self.observation_spec = self._spec("observation", Unbounded((*shape, OBSERVATION_DIM)))
+        self.observation_spec = self._spec(
+            "observation", Unbounded((*shape, OBSERVATION_DIM), dtype=dtype)
+        )
         self.action_spec = self._spec("action", Bounded(low, high, shape=(*shape, ACTION_DIM)))
         self.reward_spec = self._spec("reward", Unbounded((*shape, 1)))
         flag = Binary(1, shape=(*shape, 1), dtype=torch.bool)
@@ -44,7 +47,7 @@ class PointEnv(EnvBase):
             {name: flag.clone() for name in ("done", "truncated", "terminated")}, shape=shape
         )
         self.episode = torch.zeros(*shape, 1)
-        self.position = torch.zeros(*shape, OBSERVATION_DIM)
+        self.position = torch.zeros(*shape, OBSERVATION_DIM, dtype=dtype)
         self.age = torch.zeros(*shape, 1, dtype=torch.int64)
 
     def key(self, name: str) -> str | tuple[str, str]:
@@ -75,8 +78,45 @@ class PointEnv(EnvBase):
         )
         data[self.key("observation")] = self.position.clone()
         if reward:
-            data[self.key("reward")] = -self.position.square().sum(-1, keepdim=True)
+            data[self.key("reward")] = -self.position.float().square().sum(-1, keepdim=True)
         return data
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing here is random."""
+
+
+class TeamEnv(EnvBase):
+    """A group ``agent`` of points, each with its own action, observation and reward."""
+
+    AGENTS = 2
+
+    def __init__(self, batch_size: tuple[int, ...] = ()) -> None:
+        super().__init__(batch_size=torch.Size(batch_size), device="cpu")
+        self.group_shape = torch.Size((*batch_size, self.AGENTS))
+        self.observation_spec = self._spec("observation", Unbounded, OBSERVATION_DIM)
+        self.action_spec = self._spec("action", Bounded, ACTION_DIM, low=-1.0, high=1.0)
+        self.reward_spec = self._spec("reward", Unbounded, 1)
+
+    def _spec(self, name: str, kind: type, size: int, **bounds: float) -> Composite:
+        leaf = kind(shape=(*self.group_shape, size), **bounds)
+        group = Composite({name: leaf}, shape=self.group_shape)
+        return Composite(agent=group, shape=self.batch_size)
+
+    def _reset(self, tensordict: TensorDict | None, **kwargs) -> TensorDict:
+        self.position = (
+            torch.arange(self.AGENTS).float()[:, None].expand(*self.group_shape, OBSERVATION_DIM)
+        )
+        return TensorDict(agent=self._group(), batch_size=self.batch_size)
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        self.position = move(self.position, tensordict["agent", "action"])
+        reward = -self.position.square().sum(-1, keepdim=True)
+        data = TensorDict(agent=self._group(reward=reward), batch_size=self.batch_size)
+        return data.set("done", torch.zeros(*self.batch_size, 1, dtype=torch.bool))
+
+    def _group(self, **entries: torch.Tensor) -> TensorDict:
+        observed = {"observation": self.position.clone(), **entries}
+        return TensorDict(observed, batch_size=self.group_shape)
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing here is random."""

@@ -93,3 +93,6 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
     )
     assert float(rows[0]["share"]) == pytest.approx(float(rows[0]["chance"]), abs=0.03)
     assert float(rows[2]["share"]) > 0.9
+    for row in rows:
+        assert float(row["shuffled"]) == pytest.approx(float(row["chance"]), abs=0.05)
+        assert 0 < float(row["shuffled_sd"]) < 0.2  # two dimensions scatter by 0.1

@@ -3,10 +3,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, ParallelEnv, StepCounter, TransformedEnv
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import Compose, ParallelEnv, StepCounter, TensorDictPrimer, TransformedEnv
 
-from tests.point_env import PointEnv
+from tests.point_env import PointEnv, TeamEnv
 from tests.transform_checks import TransformChecks
 from torchrl_etl.transforms import DirectionPrimer
 
@@ -154,3 +154,19 @@ def test_other_transforms_may_follow():
 def test_bad_arguments_are_refused_at_construction(arguments, message):
     with pytest.raises(ValueError, match=message):
         DirectionPrimer(**arguments)
+
+
+def test_two_primers_of_one_key_are_refused():
+    env = TransformedEnv(PointEnv(), DirectionPrimer(2))
+    with pytest.raises(ValueError, match=r"DirectionPrimer writes 'direction'.*out_key"):
+        env.append_transform(DirectionPrimer(3))
+    with pytest.raises(ValueError, match="both write 'direction'"):
+        late = TensorDictPrimer(direction=Unbounded((2,)), expand_specs=True)
+        TransformedEnv(PointEnv(), Compose(DirectionPrimer(2), late)).reset()
+
+
+def test_agents_of_a_group_draw_directions_of_their_own():
+    env = TransformedEnv(TeamEnv((3,)), DirectionPrimer(2, out_key=("agent", "direction")))
+    direction = env.reset()["agent", "direction"]
+    assert direction.shape == (3, TeamEnv.AGENTS, 2)
+    assert len(direction.flatten(0, 1).unique(dim=0)) == 3 * TeamEnv.AGENTS

@@ -7,10 +7,20 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
+from torchrl.envs import (
+    Compose,
+    ParallelEnv,
+    RenameTransform,
+    RewardScaling,
+    SerialEnv,
+    TransformedEnv,
+    VecNormV2,
+)
+from torchrl.envs.transforms import RNDTransform
+from torchrl.envs.utils import check_env_specs
 
-from tests.point_env import HORIZON, OBSERVATION_DIM, PointEnv
+from tests.point_env import HORIZON, OBSERVATION_DIM, PointEnv, TeamEnv
 from tests.transform_checks import TransformChecks
 from torchrl_etl.modules import StateEncoder
 from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward
@@ -66,6 +76,9 @@ class TestIntrinsicReward(TransformChecks):
 
     def check_values(self, rollout):
         encoder = fixed_encoder()
+        assert "_intrinsic_reward_observation" not in rollout.keys() or (
+            "collector" not in rollout.keys()
+        ), "collectors leave the private copy out"
         with torch.no_grad():
             embedding = encoder(rollout.select("observation"))["embedding"]
             following = encoder(rollout["next"].select("observation"))["embedding"]
@@ -74,12 +87,48 @@ class TestIntrinsicReward(TransformChecks):
         assert expected.abs().max() > 1e-3
         assert set(rollout.keys()).isdisjoint({"embedding", "intrinsic_reward"})
 
+    @staticmethod
+    def multi_step():
+        multi_step = MultiStep(0.9, 3)
+        multi_step.reward_keys = ("reward", "intrinsic_reward")
+        return multi_step
+
+    def check_multi_step(self, moved, plain):
+        # Of 12 steps in episodes of 4: three rewards, or those that are left of the episode.
+        key = ("next", "intrinsic_reward")
+        bonus = plain[key].view(3, HORIZON)
+        padded = torch.cat([bonus, torch.zeros(3, 2)], 1)
+        summed = padded[:, :-2] + 0.9 * padded[:, 1:-1] + 0.81 * padded[:, 2:]
+        torch.testing.assert_close(moved[key].view(3, HORIZON), summed)
+
+    @pytest.mark.parametrize("shared", [False, True])
+    def test_group_of_agents_has_a_bonus_each_also_along_one_direction(self, shared):
+        direction = "direction" if shared else ("agent", "direction")
+        bonus = IntrinsicReward(
+            fixed_encoder(),
+            in_keys=(("agent", "observation"), direction),
+            out_key=("agent", "intrinsic_reward"),
+            normalize=False,
+        )
+        env = TransformedEnv(TeamEnv((3,)), Compose(DirectionPrimer(K, out_key=direction), bonus))
+        check_env_specs(env)
+        rollout = env.rollout(4)
+        followed = rollout[direction]
+        assert followed.shape == ((3, 4, K) if shared else (3, 4, 2, K))
+        followed = followed.unsqueeze(-2) if shared else followed
+        ends = rollout["agent", "observation"], rollout["next", "agent", "observation"]
+        with torch.no_grad():
+            start, end = (fixed_encoder().module(end) for end in ends)
+        expected = ((end - start) * followed).sum(-1, keepdim=True)
+        found = rollout["next", "agent", "intrinsic_reward"]
+        torch.testing.assert_close(found, expected)
+
     @pytest.mark.slow
     def test_parallel_workers_start_from_the_callers_root(self):
         parallel = ParallelEnv(2, self.env, mp_start_method="fork")
         try:
             state = parallel.rand_action(parallel.reset())
-            state["observation"] += 5
+            state["direction"] = -state["direction"]
             self.check_values(parallel.step(state)[:, None])
         finally:
             parallel.close(raise_if_closed=False)
@@ -339,3 +388,57 @@ def test_missing_entries_are_named():
         IntrinsicReward(doubler())(data.exclude("direction"))
     with pytest.raises(KeyError, match="'next'"):
         IntrinsicReward(doubler())(data.exclude("next"))
+
+
+def test_bonus_before_a_running_normalization_is_that_of_the_raw_observations():
+    keep = RenameTransform(["observation"], ["raw"], create_copy=True)
+    bonus = IntrinsicReward(fixed_encoder(), normalize=False)
+    chain = Compose(DirectionPrimer(K), keep, bonus, VecNormV2(in_keys=["observation"]))
+    rollout = TransformedEnv(PointEnv((3,)), chain).rollout(9, break_when_any_done=False)
+    with torch.no_grad():
+        start, end = (fixed_encoder().module(td["raw"]) for td in (rollout, rollout["next"]))
+    expected = ((end - start) * rollout["direction"]).sum(-1, keepdim=True)
+    torch.testing.assert_close(rollout["next", "intrinsic_reward"], expected)
+
+
+def test_native_autoreset_renews_the_copy_of_the_reset_env_only():
+    chain = Compose(DirectionPrimer(K), IntrinsicReward(fixed_encoder()))
+    env = TransformedEnv(PointEnv((3,)), chain)
+    state = env.rollout(2)[:, -1]["next"].exclude("reward")
+    before = state["_intrinsic_reward_observation"].clone()
+    state = state.set("_reset", torch.tensor([[False], [True], [False]]))
+    state["observation"] = state["observation"] + 7
+    after = env._reset_on_native_autoreset(state, state)["_intrinsic_reward_observation"]
+    assert torch.equal(after[[0, 2]], before[[0, 2]])
+    torch.testing.assert_close(after[1], before[1] + 7)
+
+
+def networks():
+    return nn.Linear(OBSERVATION_DIM, 2), nn.Linear(OBSERVATION_DIM, 2)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_two_rewards_under_one_key_are_refused_in_either_order(first):
+    ours, theirs = IntrinsicReward(fixed_encoder()), RNDTransform(*networks())
+    pair = (ours, theirs) if first else (theirs, ours)
+    with pytest.raises(ValueError, match=r"'intrinsic_reward'.*out_key"):
+        TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), *pair)).reset()
+    other = IntrinsicReward(fixed_encoder(), out_key="bonus")
+    TransformedEnv(
+        PointEnv(), Compose(DirectionPrimer(K), other, RNDTransform(*networks()))
+    ).reset()
+
+
+def test_a_later_scaling_of_the_bonus_is_no_second_writer():
+    scaled = RewardScaling(loc=0.0, scale=2.0, in_keys=["intrinsic_reward"])
+    bonus = IntrinsicReward(fixed_encoder(), normalize=False)
+    TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), bonus, scaled)).rollout(2)
+
+
+def test_double_precision_on_bare_data_and_an_integer_observation_are_cast():
+    for dtype in (torch.float64, torch.int32):
+        data = transitions([1.0, 0.0], [4.0, 1.0], [1.0, -1.0])
+        data["observation"] = data["observation"].to(dtype)
+        data["next", "observation"] = data["next", "observation"].to(dtype)
+        reward = IntrinsicReward(doubler(), normalize=False)(data)["next", "intrinsic_reward"]
+        assert reward.tolist() == [[6.0], [-2.0]] and reward.dtype == torch.float32

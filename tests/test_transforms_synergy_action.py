@@ -6,10 +6,12 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.collectors import Collector
 from torchrl.data import (
     Categorical,
     Composite,
     LazyTensorStorage,
+    MultiStep,
     ReplayBuffer,
     TensorDictReplayBuffer,
 )
@@ -17,12 +19,17 @@ from torchrl.envs import (
     ActionScaling,
     Compose,
     GymEnv,
+    MultiStepTransform,
     PendulumEnv,
+    RenameTransform,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
 )
+from torchrl.envs.utils import check_env_specs
 
+import torchrl_etl.envs  # noqa: F401 registers the analytic task
 from tests.point_env import ACTION_DIM, PointEnv, move
 from tests.transform_checks import TransformChecks
 from torchrl_etl.modules import SynergyDecoder
@@ -45,7 +52,7 @@ def decode(synergy, decoder=None):
 
 
 class TestSynergyAction(TransformChecks):
-    synergy_key = "synergy"
+    synergy_key, decoded_key = "synergy", "action"
 
     @staticmethod
     def transform(nested=False):
@@ -66,9 +73,15 @@ class TestSynergyAction(TransformChecks):
         before = executed[..., :-1, :].where(~rollout["next", "done"][..., :-1, :], 0.0)
         torch.testing.assert_close(rollout["executed_action"][..., 1:, :], before)
         assert (executed.norm(dim=-1) > 0.1).all()
-        assert set(rollout["next"].keys()).isdisjoint({"action", "synergy", "_executed_action"})
-        assert "_executed_action" not in set(rollout.keys())
+        assert set(rollout["next"].keys()).isdisjoint({"action", "synergy", "decoded_action"})
+        private = [key for td in (rollout, rollout["next"]) for key in td.keys() if key[0] == "_"]
+        assert not private
+        if "collector" in rollout.keys():
+            assert torch.equal(rollout[self.decoded_key], executed)
         assert not executed.requires_grad
+
+    def check_multi_step(self, moved, plain):
+        torch.testing.assert_close(moved[self.decoded_key], decode(moved[self.synergy_key]))
 
     def test_the_callers_root_never_holds_the_decoded_action(self):
         env = self.env()
@@ -143,7 +156,7 @@ class TestSynergyAction(TransformChecks):
 class TestSynergyActionUnderTheActionKey(TestSynergyAction):
     """For policies that write ``action`` and nothing else."""
 
-    synergy_key = "action"
+    synergy_key, decoded_key = "action", "decoded_action"
 
     @staticmethod
     def transform(nested=False):
@@ -233,15 +246,119 @@ def test_native_autoreset_returns_only_the_reset_env_to_rest():
     assert torch.equal(after["executed_action"][[0, 2]], before[[0, 2]])
 
 
-def test_what_is_recorded_is_the_decoders_output_whatever_scales_it_later():
+def collect(env, **kwargs):
+    """A batch of 12 frames of TorchRL's collector."""
+    collector = Collector(env, None, frames_per_batch=12, total_frames=12, **kwargs)
+    (batch,) = collector
+    collector.shutdown()
+    return batch
+
+
+def pairs(batch, decoder=None):
+    """Asserts that root synergy and root action belong together."""
+    torch.testing.assert_close(batch["action"], decode(batch["synergy"], decoder))
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [{}, {"device": "cpu"}, {"storing_device": "cpu"}, {"use_buffers": False}],
+    ids=str,
+)
+@pytest.mark.parametrize("layout", ["single", "batched", "around serial", "no device", "appended"])
+def test_collected_pairs_are_together_at_the_root(layout, kwargs):
+    env = {
+        "single": PointEnv,
+        "batched": partial(PointEnv, (3,)),
+        "around serial": partial(SerialEnv, 2, PointEnv),
+        "no device": partial(GymEnv, "torchrl_etl/Overactuated-v0", device=None),
+        "appended": partial(TransformedEnv, PointEnv(), StepCounter()),
+    }[layout]()
+    decoder = fixed_decoder(16 if layout == "no device" else ACTION_DIM)
+    env = TransformedEnv(env, SynergyAction(decoder))
+    for steps in (1, 3):  # a collector does not change what rollouts and resets are
+        env.rollout(steps)
+    pairs(collect(env, **kwargs), decoder)
+
+
+def keep_at_root():
+    return RenameTransform([("next", "executed_action")], ["action"], create_copy=True)
+
+
+def test_multi_step_leaves_pairs_together():
+    make = partial(TransformedEnv, PointEnv(), SynergyAction(fixed_decoder()))
+    pairs(collect(make(), postproc=MultiStep(0.9, 3)))
+
+
+def test_multi_step_leaves_pairs_of_workers_together_behind_a_rename():
+    def transformed():
+        return TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
+
+    batch = collect(
+        SerialEnv(2, transformed), postproc=nn.Sequential(keep_at_root(), MultiStep(0.9, 3))
+    )
+    pairs(batch)
+
+
+@pytest.mark.parametrize("collected", [True, False])
+def test_multi_step_transform_of_a_buffer_leaves_pairs_together(collected):
+    env = TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
+    batch = (
+        collect(env) if collected else keep_at_root()(env.rollout(12, break_when_any_done=False))
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(20), transform=MultiStepTransform(3, 0.9), batch_size=8
+    )
+    buffer.extend(batch)
+    pairs(buffer.sample())
+    moved = buffer[:]["next", "executed_action"] - decode(buffer[:]["synergy"])
+    assert moved.abs().max() > 1e-3
+
+
+class _Clip(Transform):
+    """Halves the range that the simulator gets, as an inner safety clip would."""
+
+    def __init__(self) -> None:
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+
+    def _inv_apply_transform(self, action):
+        return action.clamp(-0.5, 0.5)
+
+
+def test_executed_action_behind_a_scaling_is_what_ran_and_root_action_what_was_decoded():
     env = TransformedEnv(
         PointEnv(low=0.0, high=1.0), Compose(ActionScaling(), SynergyAction(fixed_decoder()))
     )
-    rollout = env.rollout(3)
-    executed = rollout["next", "executed_action"]
-    torch.testing.assert_close(executed, decode(rollout["synergy"]))
-    expected = move(rollout["observation"], (executed + 1) / 2)
+    check_env_specs(env)
+    rollout = collect(env)
+    decoded, executed = rollout["action"], rollout["next", "executed_action"]
+    torch.testing.assert_close(decoded, decode(rollout["synergy"]))
+    torch.testing.assert_close(executed, (decoded + 1) / 2)
+    expected = move(rollout["observation"], executed)
     torch.testing.assert_close(rollout["next", "observation"], expected)
+    assert env.observation_spec["executed_action"] == env.base_env.action_spec
+    assert rollout["executed_action"][0].eq(0).all()
+
+
+def test_executed_action_behind_a_clip_is_clipped():
+    decoder = fixed_decoder()
+    with torch.no_grad():
+        decoder.module.scale.fill_(20.0)
+    env = TransformedEnv(PointEnv(), Compose(_Clip(), SynergyAction(decoder)))
+    rollout = collect(env)
+    assert rollout["action"].abs().max() > 0.6
+    assert torch.equal(rollout["next", "executed_action"], rollout["action"].clamp(-0.5, 0.5))
+
+
+def test_scaling_in_an_inner_environment_is_warned_of():
+    inner = TransformedEnv(PointEnv(low=0.0, high=1.0), ActionScaling())
+    with pytest.warns(UserWarning, match="append SynergyAction to that environment"):
+        TransformedEnv(inner, SynergyAction(fixed_decoder()), auto_unwrap=False)
+
+
+def test_repr_says_what_decodes_into_what():
+    shown = repr(SynergyAction(fixed_decoder()))
+    assert "SynergyDecoder of 2 numbers into 5 actuators in [-1, 1]" in shown
+    assert "decoded_key='action'" in shown
 
 
 def test_an_env_that_is_not_batch_locked_takes_any_batch():
@@ -332,3 +449,5 @@ def test_decoder_without_its_attributes_is_refused():
 def test_colliding_keys_are_refused():
     with pytest.raises(ValueError, match="'action', which already names"):
         SynergyAction(fixed_decoder(), executed_key="action")
+    with pytest.raises(ValueError, match="decoded_key is 'synergy', which already names"):
+        SynergyAction(fixed_decoder(), decoded_key="synergy")

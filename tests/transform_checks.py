@@ -7,13 +7,36 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.collectors import MultiSyncCollector
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.data import MultiStep
+from torchrl.envs import (
+    CatFrames,
+    EnvBase,
+    ObservationNorm,
+    ParallelEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
-from tests.point_env import PointEnv, vectorized_point
+from tests.point_env import PointEnv, TeamEnv, vectorized_point
 
 WORKERS = 2
+
+
+def rolled(env: EnvBase) -> TensorDictBase:
+    torch.manual_seed(0)
+    return env.rollout(3)
+
+
+def collected(env: EnvBase, postproc) -> TensorDictBase:
+    torch.manual_seed(0)
+    collector = Collector(env, None, frames_per_batch=12, total_frames=12, postproc=postproc)
+    (batch,) = collector
+    collector.shutdown()
+    return batch
 
 
 class TransformChecks(ABC):
@@ -137,6 +160,55 @@ class TransformChecks(ABC):
         assert sum(batch.numel() for batch in batches) == 24
         for batch in batches:
             self.check_values(batch)
+
+    # Among other people's parts
+
+    def test_a_later_transform_that_rewrites_the_observation_changes_no_values(self):
+        def normalized(env):
+            return TransformedEnv(
+                env, ObservationNorm(loc=3.0, scale=2.0, in_keys=["observation"]), auto_unwrap=False
+            )
+
+        for make in (self.env, partial(SerialEnv, WORKERS, self.env)):
+            check_env_specs(normalized(make()))
+            alone, followed = (rolled(env) for env in (make(), normalized(make())))
+            assert (followed["observation"] - alone["observation"]).abs().max() > 1
+            observed = ("observation", ("next", "observation"))
+            assert (followed.exclude(*observed) == alone.exclude(*observed)).all()
+
+    def test_frames_concatenated_behind_it_change_no_values(self):
+        env = self.env(batch_size=(3,))
+        env.append_transform(CatFrames(2, dim=-1, in_keys=["observation"], out_keys=["frames"]))
+        check_env_specs(env)
+        self.check_values(env.rollout(6, break_when_any_done=False))
+
+    def test_multi_step_returns_leave_the_root_alone(self):
+        plain, moved = (collected(self.env(), postproc) for postproc in (None, self.multi_step()))
+        for key in plain.exclude("next", "collector").keys(True, True):
+            assert torch.equal(moved[key], plain[key]), key
+        assert not torch.equal(moved["next", "observation"], plain["next", "observation"])
+        self.check_multi_step(moved, plain)
+
+    @staticmethod
+    def multi_step() -> MultiStep:
+        return MultiStep(0.9, 3)
+
+    def check_multi_step(self, moved, plain) -> None:  # noqa: B027 most have nothing to add
+        """What else must hold of a batch with n-step returns, beside the one without."""
+
+    @pytest.mark.parametrize("batch_size", [(), (3,)])
+    def test_agent_group_keeps_its_batch_size(self, batch_size):
+        env = TransformedEnv(TeamEnv(batch_size), self.transform(nested=True))
+        check_env_specs(env)
+        for spec in (env.full_action_spec, env.full_observation_spec, env.full_reward_spec):
+            assert spec["agent"].shape == (*batch_size, TeamEnv.AGENTS)
+        assert env.rollout(3)["agent"].batch_size[: len(batch_size) + 1] == (*batch_size, 3)
+        collected(env, None)
+
+    def test_double_precision_observations_are_taken(self):
+        env = TransformedEnv(PointEnv(dtype=torch.float64), self.transform())
+        check_env_specs(env)
+        assert env.rollout(3)["observation"].dtype == torch.float64
 
     # What the transform means elsewhere
 

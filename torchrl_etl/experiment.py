@@ -17,7 +17,7 @@ from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import episode_length, resolve_task
 from torchrl_etl.methods import METHODS
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.training.config import validate
+from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import StopOnSignal
@@ -58,6 +58,8 @@ class Experiment:
         if config.frames is not None:
             self._divide_frames()
         self.method.check()
+        if warning := bfloat16_warning(self.config):
+            say(f"Warning: {warning}")
         self.resume = resume is not None
 
     def run(self) -> dict[str, Any]:

@@ -133,23 +133,24 @@ class EMEBonus(TransitionReward):
         return self._networks[1]
 
     @property
-    def _observed(self) -> Sequence[NestedKey]:
-        return self.in_keys[:1]  # the other is the action, which every step has
+    def _typed_by(self) -> NestedKey:
+        return self.reward_key
 
     @torch.no_grad()
     def _rewards(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        tensordict: TensorDictBase,
+        next_tensordict: TensorDictBase,
     ) -> tuple[Tensor, Tensor]:
-        observation_key, action_key = self.in_keys
-        observation = self._read(tensordict, observation_key)
-        action = self._read(tensordict, action_key)
-        next_observation = self._read(next_tensordict, observation_key, "next")
+        action = self._read(tensordict, self.in_keys[1])
         reward = self._read(next_tensordict, self.reward_key, "next")
         # One pass through the encoder for both ends of the transition.
         ends = evaluate(self.encoder, torch.stack([observation, next_observation]))
         distance = functional.l2_distance(*ends.unbind(0)).unsqueeze(-1)
         scale = diversity_scale(evaluate(self.ensemble, observation, action), self.max_scale)
-        bonus = distance.to(reward.device) * scale.to(reward.device)
+        bonus = distance.to(reward) * scale.to(reward)
         return bonus, reward + self.weight * self._in_units_of(reward, bonus)
 
     def _in_units_of(self, reward: Tensor, bonus: Tensor) -> Tensor:

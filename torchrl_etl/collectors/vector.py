@@ -151,6 +151,7 @@ class VectorCollector(Collector):
             synergy = torch.from_numpy(written[self._synergy_action.synergy_key])
             action = self._synergy_action.decode(synergy).numpy()
             after[self._synergy_action.executed_key] = action
+            written[self._synergy_action.decoded_key] = action
         observations, reward, terminated, truncated, _ = self._simulators.step(action)
         after |= _named(observations)
         after["reward"] = reward.astype(np.float32)[:, None]

@@ -1,8 +1,10 @@
-"""An update as one compiled graph."""
+"""An update as one compiled graph, or as it is where nothing can be compiled."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import warnings
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any
 
@@ -10,6 +12,8 @@ import torch
 from tensordict.nn import CudaGraphModule
 
 __all__ = ["compiled", "cuda_graph"]
+
+_ELSE = "compile=false leaves out the attempt"
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,6 +23,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     a backward half: on CPUs without AVX-512 the masks of rectifiers, kept as booleans, would cost
     as much as a third of the products.
 
+    Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
+    the compiler does not know) costs a warning that says why; the function then runs uncompiled,
+    this call included. It must change nothing but what it returns.
+
     Examples:
         >>> import torch
         >>> x = torch.ones(3, requires_grad=True)
@@ -26,12 +34,29 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         >>> slope(x)  # doctest: +SKIP
         tensor([2., 2., 2.])
     """
-    traced = torch.compile(function, fullgraph=True, isolate_recompiles=True)
+    traced: Callable[..., Any] | None = None
+    failed = False
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        with torch._dynamo.config.patch(trace_autograd_ops=True):
-            return traced(*args)
+        nonlocal traced, failed
+        if failed:
+            return function(*args)
+        try:
+            if traced is None:
+                traced = torch.compile(
+                    function, fullgraph=True, isolate_recompiles=True, options=_options()
+                )
+            with torch._dynamo.config.patch(trace_autograd_ops=True):
+                return traced(*args)
+        except Exception as error:
+            failed = True
+            warnings.warn(
+                f"Updates run uncompiled, which takes about twice the time: {_reason(error)}.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return function(*args)
 
     return call
 
@@ -39,3 +64,70 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
     """Record what a function of a tensordict does on the GPU and play it back, as one launch."""
     return CudaGraphModule(function, in_keys=[], out_keys=[], warmup=5)
+
+
+def _options() -> dict[str, Any] | None:
+    """What lets inductor (torch 2.13) compile in folders whose names have a space.
+
+    It hands the folder of PyTorch's libraries, its cache and its precompiled headers to a shell
+    without quotes.
+    """
+    from torch._inductor.runtime.cache_dir_utils import cache_dir, default_cache_dir
+    from torch.utils.cpp_extension import TORCH_LIB_PATH
+
+    options: dict[str, Any] = {}
+    if _is_split(cache_dir()):
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"/tmp/torchinductor_{os.getuid()}"
+    if _is_split(default_cache_dir()):  # where its headers are, whatever the cache is
+        options["cpp_cache_precompile_headers"] = False
+    if _is_split(TORCH_LIB_PATH):
+        # The symbols that a kernel needs are those of the process, which has loaded PyTorch.
+        options["aot_inductor.link_libtorch"] = False
+    return options or None
+
+
+def _is_split(path: str) -> bool:
+    return os.name == "posix" and any(character in path for character in " \t\n'\"\\")
+
+
+def _reason(error: BaseException) -> str:
+    """Why a compilation failed and what helps, in half a sentence."""
+    from torch._inductor.exc import CppCompileError, InvalidCxxCompiler, TritonMissing
+
+    for cause in _causes(error):
+        match cause:
+            case InvalidCxxCompiler():
+                *_, name = _as_tuple(torch._inductor.config.cpp.cxx)
+                return (
+                    f"there is no C++ compiler ({name} does not run); install one "
+                    "(apt install g++), or name one in the variable CXX"
+                )
+            case TritonMissing():
+                return "Triton, which compiles for GPUs, is not installed; pip install triton"
+            case CppCompileError() if "Python.h" in cause.output:
+                return "the headers of Python are missing; install them (apt install python3-dev)"
+            case CppCompileError():
+                return f"the C++ compiler failed ({_first_line(cause.output)}); {_ELSE}"
+            case OSError() if cause.filename:
+                return (
+                    f"{cause.filename}: {cause.strerror}; name a folder that can be written, and "
+                    "has room, in the variable TORCHINDUCTOR_CACHE_DIR"
+                )
+    return f"{type(error).__name__}: {_first_line(str(error))}; {_ELSE}"
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception and those that it came from, the innermost first."""
+    if error is not None:
+        yield from _causes(getattr(error, "inner_exception", None) or error.__cause__)
+        yield error
+
+
+def _as_tuple(value: Any) -> tuple[Any, ...]:
+    return tuple(value) if isinstance(value, (list, tuple)) else (value,)
+
+
+def _first_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    telling = [line for line in lines if "error" in line or "cannot" in line]
+    return (telling or lines or ["without a word"])[0].rstrip(".")

@@ -14,6 +14,13 @@ from torchrl_etl.checks import check_positive
 __all__ = ["GaussianDynamics", "StateEncoder"]
 
 
+class _Network(nn.Sequential):
+    """Takes observations of any dtype: MuJoCo's Gymnasium tasks observe in double precision."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return super().forward(observation.to(self[0].weight.dtype))
+
+
 class StateEncoder(TensorDictModule):
     """State encoder φ: S → R^k whose distances are trained to be behavioral distances.
 
@@ -31,7 +38,8 @@ class StateEncoder(TensorDictModule):
         out_keys (sequence of NestedKey): the embedding. Default: ``("embedding",)``.
 
     Keys:
-        reads ``observation`` [*, O]; writes ``embedding`` [*, k], unbounded.
+        reads ``observation`` [*, O], of any real dtype; writes ``embedding`` [*, k], unbounded, in
+        the dtype of the weights.
 
     Raises:
         ValueError: if a size is not positive or ``hidden`` is empty.
@@ -61,7 +69,7 @@ class StateEncoder(TensorDictModule):
                 "hidden is empty; give at least one width, for the layer that is normalized."
             )
         first, *rest = hidden
-        network = nn.Sequential(
+        network = _Network(
             nn.Linear(observation_dim, first),
             nn.LayerNorm(first),
             nn.ReLU(),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
@@ -14,11 +15,13 @@ from torchrl.data import Bounded
 
 from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
+from torchrl_etl.modules.recorded_actions import as_actions
 
 __all__ = ["SynergyDecoder", "SynergyMap"]
 
 # Where synergies alone end: in single precision a tanh reaches 1, whence no residual leads back.
 INSIDE = 1.0 - 1e-6
+_MOST_ROWS = 100_000
 
 
 class _ScaledDecoder(nn.Module):
@@ -139,13 +142,19 @@ class SynergyDecoder(SynergyMap):
 
     @classmethod
     def from_gmvae(
-        cls, gmvae: GMVAE, actions: Tensor | None = None, *, residual: float = 0.0, **keys: Any
+        cls,
+        gmvae: GMVAE,
+        actions: Tensor | np.ndarray | None = None,
+        *,
+        residual: float = 0.0,
+        **keys: Any,
     ) -> SynergyDecoder:
         """Take over a copy of the GMVAE's decoder.
 
         Args:
             gmvae (GMVAE): the fitted model; left as it is.
-            actions (Tensor, optional): actions [N, n] it was fitted on. The box of coefficients
+            actions (array, optional): actions [N, n] it was fitted on, see
+                :func:`~torchrl_etl.modules.recorded_actions.as_actions`. The box of coefficients
                 then spans the 1st to 99th percentile of their latents in each dimension; without
                 actions it spans two standard deviations of the mixture prior.
 
@@ -153,6 +162,8 @@ class SynergyDecoder(SynergyMap):
             residual (float): see the class.
             in_keys, out_keys: see the class.
         """
+        if actions is not None:
+            actions = as_actions(actions, low=gmvae.low, high=gmvae.high, min_rows=2)
         decoder = cls(
             gmvae.latent_dim,
             gmvae.action_dim,
@@ -169,7 +180,8 @@ class SynergyDecoder(SynergyMap):
                 low = (gmvae.prior_loc - 2 * gmvae.prior_scale).amin(0)
                 high = (gmvae.prior_loc + 2 * gmvae.prior_scale).amax(0)
             else:
-                latent = gmvae.infer(actions)
+                # torch.quantile takes 16 million numbers at most.
+                latent = gmvae.infer(actions[:: 1 + len(actions) // _MOST_ROWS])
                 low, high = latent.quantile(latent.new_tensor([0.01, 0.99]), dim=0)
             scaled.center.copy_((high + low) / 2)
             scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
@@ -245,11 +257,12 @@ class SynergyDecoder(SynergyMap):
         return tanh_sum_log_slope(*self.module.summands(synergy)).sum(-1)
 
     @torch.no_grad()
-    def encode(self, gmvae: GMVAE, action: Tensor) -> Tensor:
+    def encode(self, gmvae: GMVAE, action: Tensor | np.ndarray) -> Tensor:
         """Coefficients [*, d] of actions [*, n], by the GMVAE that the decoder is from.
 
         They are clamped to the box that a policy acts in.
         """
+        action = as_actions(action, low=gmvae.low, high=gmvae.high)
         scaled = self.module
         return ((gmvae.infer(action) - scaled.center) / scaled.scale).clamp(-1, 1)
 

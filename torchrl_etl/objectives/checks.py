@@ -1,10 +1,31 @@
-"""An argument check that several losses share."""
+"""Argument checks that several losses share."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
+
+from tensordict.utils import NestedKey, unravel_key
 from torch import nn
 
-__all__ = ["check_parts"]
+__all__ = ["check_parts", "warn_of_previous_action"]
+
+
+def warn_of_previous_action(reader: str, keys: Iterable[NestedKey]) -> None:
+    """Warn if a loss reads root ``executed_action``, which belongs to the step before.
+
+    Examples:
+        >>> warn_of_previous_action("DecoderLoss", ["action", ("next", "executed_action")])
+    """
+    for key in map(unravel_key, keys):
+        path = (key,) if isinstance(key, str) else key
+        if path[-1] == "executed_action" and path[0] != "next":
+            warnings.warn(
+                f"{reader} reads {key!r} at the root, which SynergyAction leaves there from the "
+                "step before; read 'action' in a collector's batches, or ('next', "
+                "'executed_action').",
+                stacklevel=4,
+            )
 
 
 def check_parts(name: str, module: object, kind: type[nn.Module], *, outputs: int = 0) -> None:

@@ -12,7 +12,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.functional import reconstruction_loss
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, warn_of_previous_action
 
 __all__ = ["DecoderLoss"]
 
@@ -88,6 +88,7 @@ class DecoderLoss(LossModule):
 
     def _set_in_keys(self) -> None:
         self.in_keys = [self.tensor_keys.synergy, self.tensor_keys.action]
+        warn_of_previous_action(type(self).__name__, self.in_keys)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

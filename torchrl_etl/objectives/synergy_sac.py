@@ -13,7 +13,7 @@ from tensordict.nn import (
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, warn_of_previous_action
 from torchrl_etl.objectives.sac import LeanSACLoss, call
 
 __all__ = ["SynergySACLoss"]
@@ -126,6 +126,7 @@ class SynergySACLoss(LeanSACLoss):
                 f"{sampled} and the critic reads {list(qvalue_network.in_keys)}; the decoder's one "
                 "input must be the actor's sample and its one output the critic's action."
             )
+        warn_of_previous_action(f"The critic of {type(self).__name__}", decoded)
         self.decoded_key: NestedKey = decoded[0]
         self.train_decoder = train_decoder
         super().__init__(actor_network, qvalue_network, **kwargs)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_etl.checks import check_real, check_sizes
 from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.objectives import GMVAELoss
 from torchrl_etl.synergies.model import SynergyModel
 
@@ -77,7 +79,7 @@ class GMVAESynergies(SynergyModel):
 
 def fit_gmvae(
     gmvae: GMVAE,
-    actions: Tensor,
+    actions: Tensor | np.ndarray,
     *,
     updates: int,
     batch_size: int = 256,
@@ -88,11 +90,17 @@ def fit_gmvae(
 
     Args:
         gmvae (GMVAE): trained in place.
-        actions (Tensor): [N, n], in action units.
+        actions (array): [N, n], in action units: a tensor, a NumPy array or lists, of any real
+            dtype.
 
     Keyword Args:
         updates, batch_size (int), lr (float): of Adam.
         on_update (callable): called before every update; may raise to stop.
+
+    Raises:
+        TypeError, ValueError: before anything is trained, if the actions are not numbers, have
+            another width than the GMVAE, a value that is not finite or far outside of its bounds,
+            or one row only.
 
     Examples:
         >>> import torch
@@ -103,6 +111,7 @@ def fit_gmvae(
         >>> variance_accounted_for(actions, gmvae.reconstruct(actions).detach()) > 0.8
         True
     """
+    actions = as_actions(actions, low=gmvae.low, high=gmvae.high, min_rows=2)
     loss = GMVAELoss(gmvae)
     optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
     for _ in range(updates):

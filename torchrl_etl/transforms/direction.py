@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,16 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.transforms.keys import (
+    group_reset,
+    group_shape,
+    refuse_shared_keys,
+    set_leaf,
+)
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+    from torchrl.envs.transforms import Transform
 
 __all__ = ["DirectionPrimer"]
 
@@ -23,6 +33,8 @@ class DirectionPrimer(TensorDictPrimer):
     partial reset only the envs that start anew get a new direction. Draws come from torch's global
     generator. TorchRL does not seed it in worker processes until ``set_seed`` is called on the
     batched env or collector: without that call workers can draw identical directions.
+
+    In a group of agents (``out_key=("agents", "direction")``) each draws a direction of its own.
 
     Called on a tensordict outside an env (in an ``nn.Sequential``, on a replay buffer's sample
     path) it draws one direction per element where none is present, and leaves present ones alone.
@@ -48,7 +60,8 @@ class DirectionPrimer(TensorDictPrimer):
 
     Raises:
         ValueError: if a size is not positive, the kind is unknown, or ``num_directions`` does not
-            fit the kind or exceeds k.
+            fit the kind or exceeds k; when attached, if ``out_key`` is written by something else
+            too.
 
     Examples:
         >>> import torch
@@ -111,11 +124,25 @@ class DirectionPrimer(TensorDictPrimer):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         # The base class expands ``self.primers`` in place, which ties the transform to the first
         # env it meets; ours stays unbatched, so a clone serves an env of another batch size.
-        leaf = self._leaf.expand(*observation_spec.shape, self.embedding_dim)
+        (key,) = self.out_keys
+        leaf = self._leaf.expand(*group_shape(self.parent, key), self.embedding_dim)
         if observation_spec.device is not None:
             leaf = leaf.to(observation_spec.device)
-        observation_spec[self.out_keys[0]] = leaf
+        set_leaf(observation_spec, key, leaf, self.parent)
         return observation_spec
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        refuse_shared_keys(self, output_spec, self.out_keys)
+        return super().transform_output_spec(output_spec)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        if self.parent is not None:
+            try:
+                refuse_shared_keys(self, self.parent.output_spec, self.out_keys)
+            except ValueError:
+                self.reset_parent()
+                raise
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.get(self.out_keys[0], None) is None:
@@ -126,19 +153,23 @@ class DirectionPrimer(TensorDictPrimer):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # A draw for every env: at a partial reset the env keeps those of the envs that reset.
-        return tensordict_reset.set(
-            self.out_keys[0], self.draw(tensordict_reset.batch_size, tensordict_reset.device)
-        )
+        (key,) = self.out_keys
+        shape = tensordict_reset.batch_size
+        if self.parent is not None:  # an env that is not batch-locked leaves its size to the data
+            shape = shape + group_shape(self.parent, key)[self.parent.ndim :]
+        elif not isinstance(key, str) and key[:-1] in tensordict_reset.keys(True):
+            shape = tensordict_reset.get(key[:-1]).batch_size
+        return tensordict_reset.set(key, self.draw(shape, tensordict_reset.device))
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # Here nobody merges by the reset mask for us.
-        present = tensordict.get(self.out_keys[0])
-        reset = tensordict.get(self.reset_key)
-        fresh = self._reset_func(tensordict, tensordict_reset).get(self.out_keys[0])
-        reset = expand_as_right(reset.reshape(tensordict.batch_size), fresh)
-        return tensordict_reset.set(self.out_keys[0], torch.where(reset, fresh, present))
+        (key,) = self.out_keys
+        present = tensordict.get(key)
+        fresh = self._reset_func(tensordict, tensordict_reset).get(key)
+        reset = expand_as_right(group_reset(self.parent, tensordict, key), fresh)
+        return tensordict_reset.set(key, torch.where(reset, fresh, present))
 
     def __repr__(self) -> str:
         return (

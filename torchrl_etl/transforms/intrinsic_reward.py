@@ -23,10 +23,17 @@ class IntrinsicReward(TransitionReward):
     The same class works in three places:
 
     - on an env: every step writes the bonus, for logging or on-policy learners. The env's state
-      spec then holds the observation and the direction, because a step needs both;
+      spec then holds the direction and a private copy of the observation, so that the bonus is
+      that of the observations which this transform sees, whatever later transforms make of them;
     - on a replay buffer: every *sampled* batch gets the bonus of the current encoder, so that the
       reward is never stale. Nothing is written when the buffer is extended;
     - called on a tensordict with root and ``"next"`` entries, any batch size, time included.
+
+    In a group of agents each has a bonus of its own; a direction outside of the group is that of
+    all. Under n-step returns a bonus on the environment is a reward like any other and has to be
+    named: ``MultiStepTransform(..., reward_keys=["reward", "intrinsic_reward"])``, or the attribute
+    ``reward_keys`` of ``MultiStep``. On a buffer the bonus of an n-step transition is that of its
+    two ends, which is the undiscounted sum over the steps between.
 
     The encoder is held by reference and belongs to whoever trains it: the transform evaluates it
     without gradients on the encoder's own device and never copies, moves, freezes or switches it
@@ -69,6 +76,7 @@ class IntrinsicReward(TransitionReward):
         TypeError: if the encoder has no in- and out-keys.
         ValueError: if the encoder has several of them, ``in_keys`` is not a pair, or ``decay`` is
             outside (0, 1); at the first call if embedding and direction differ in size.
+        ValueError: when attached, if ``out_key`` is written by something else too.
         KeyError: if an input is in neither the tensordict nor the specs of the env.
 
     Examples:
@@ -144,28 +152,39 @@ class IntrinsicReward(TransitionReward):
         """The encoder given at construction, not a copy."""
         return self._encoder
 
+    @property
+    def _carried(self) -> Sequence[NestedKey]:
+        return self.in_keys[1:]
+
+    @property
+    def _typed_by(self) -> NestedKey:
+        return self.in_keys[1]
+
     @torch.no_grad()
     def _rewards(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        tensordict: TensorDictBase,
+        next_tensordict: TensorDictBase,
     ) -> tuple[Tensor]:
-        observation_key, direction_key = self.in_keys
-        observation = self._read(tensordict, observation_key)
+        direction_key = self.in_keys[1]
         direction = self._read(tensordict, direction_key)
-        next_observation = self._read(next_tensordict, observation_key, "next")
         # One pass through the encoder for both ends of the transition.
         ends = evaluate(self.encoder, torch.stack([observation, next_observation]))
-        embedding, next_embedding = ends.unbind(0)
+        embedding, next_embedding = ends.to(direction).unbind(0)
         if embedding.shape[-1] != direction.shape[-1]:
             raise ValueError(
                 f"The encoder's embedding has {embedding.shape[-1]} dimensions but "
                 f"{direction_key!r} has {direction.shape[-1]}; give DirectionPrimer and encoder "
                 "the same embedding_dim."
             )
-        bonus = direction_bonus(embedding, next_embedding, direction.to(embedding.device))
-        bonus = bonus.to(direction.device)
+        while direction.ndim < embedding.ndim:  # one direction for a group of agents
+            direction = direction.unsqueeze(-2)
+        bonus = direction_bonus(embedding, next_embedding, direction.expand_as(embedding))
         bonus = self._scaled(bonus, self.deviation)
         if self.extrinsic_weight:
-            reward = self._read(next_tensordict, self.reward_key, "next")
+            reward = self._read(next_tensordict, self.reward_key, "next").to(bonus)
             bonus = bonus + self.extrinsic_weight * self._scaled(reward, self.reward_deviation)
         return (bonus,)
 

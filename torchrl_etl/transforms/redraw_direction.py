@@ -66,8 +66,9 @@ class RedrawDirection(Transform):
                 f"RedrawDirection reads {key!r} at both ends of a transition; beside what is "
                 f"missing are {sorted(map(str, tensordict.keys(True, True)))}."
             )
-        drawn = self.primer.draw(tensordict.batch_size, followed.device)
-        again = torch.rand(tensordict.batch_size, device=followed.device) < self.share
+        shape = followed.shape[:-1]  # in a group of agents, each of them
+        drawn = self.primer.draw(shape, followed.device)
+        again = torch.rand(shape, device=followed.device) < self.share
         direction = torch.where(expand_as_right(again, drawn), drawn, followed)
         return tensordict.set(key, direction).set(unravel_key(("next", key)), direction.clone())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,8 +11,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
+from torchrl.collectors import Collector
 from torchrl.data import Bounded, Composite, ReplayBuffer, TensorSpec, Unbounded
-from torchrl.envs.transforms import ModuleTransform
+from torchrl.envs.transforms import ModuleTransform, TransformedEnv
+
+from torchrl_etl.transforms.keys import group_reset, private_key, set_leaf
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -24,9 +28,18 @@ class SynergyAction(ModuleTransform):
     """Lets a policy act through a synergy decoder.
 
     The action spec of the transformed env is the decoder's ``synergy_spec``; at each step the
-    inverse pass decodes the synergy into the action that the base env executes, without gradients,
-    and the executed action is recorded with the transition. Root ``synergy`` and
-    ``("next", "executed_action")`` of one transition belong together.
+    inverse pass decodes the synergy into the action that the env executes, without gradients.
+
+    In a collector's batches root ``synergy`` and root ``action`` belong together, as they would if
+    the policy ended in the decoder, and stay together under n-step returns. What the simulator
+    executed in the end, after clips and scalings between it and this transform, is
+    ``("next", "executed_action")``; root ``executed_action`` is that of the step before.
+
+    ``env.step``, ``env.rollout`` and the workers of ``SerialEnv`` and ``ParallelEnv`` cannot write
+    to the root, and leave ``action`` out. There the pair is root ``synergy`` and
+    ``("next", "executed_action")``, and before n-step returns
+    ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)`` brings it to
+    the root.
 
     The decoder is held by reference: changing its weights in place changes the next step. It is a
     submodule, so ``state_dict()`` holds it and attaching moves it to the env's device and to eval
@@ -46,14 +59,17 @@ class SynergyAction(ModuleTransform):
     Keyword Args:
         synergy_key (NestedKey): what the policy writes. ``"action"`` serves policies that know no
             other key; the recorded ``"action"`` is then the synergy. Default: ``"synergy"``.
-        executed_key (NestedKey): where the decoded action is recorded.
+        executed_key (NestedKey): where the executed action is recorded.
             Default: ``"executed_action"``.
         action_key (NestedKey, optional): the base env's action. Default: the decoder's out-key.
+        decoded_key (NestedKey, optional): where a collector's batch has the decoded action.
+            Default: ``action_key``, and ``"decoded_action"`` beside it where the synergy is there.
 
     Keys:
-        reads ``synergy`` [*, d] in [-1, 1]; the base env gets ``action`` [*, n] in [low, high],
-        which the caller's tensordict never sees; writes ``("next", "executed_action")`` [*, n] and,
-        at reset, ``executed_action``: zeros brought into the bounds.
+        reads ``synergy`` [*, d] in [-1, 1]; writes ``("next", "executed_action")``, of the base
+        env's action spec, at reset ``executed_action``, zeros brought into the bounds, and, under a
+        collector, ``action`` [*, n] in [low, high]. In a group of agents all of them lie in the
+        group, if their keys say so.
 
     Raises:
         TypeError: if the decoder lacks keys or attributes, or the transform meets a replay buffer.
@@ -83,6 +99,7 @@ class SynergyAction(ModuleTransform):
         synergy_key: NestedKey = "synergy",
         executed_key: NestedKey = "executed_action",
         action_key: NestedKey | None = None,
+        decoded_key: NestedKey | None = None,
     ) -> None:
         needed = ("in_keys", "out_keys", "synergy_spec", "action_dim", "low", "high")
         missing = [name for name in needed if not hasattr(decoder, name)]
@@ -100,10 +117,19 @@ class SynergyAction(ModuleTransform):
         self.synergy_key = unravel_key(synergy_key)
         self.executed_key = unravel_key(executed_key)
         self.action_key = unravel_key(decoder.out_keys[0] if action_key is None else action_key)
+        if decoded_key is None:
+            taken = self.action_key == self.synergy_key
+            decoded_key = _beside(self.action_key, "decoded_action") if taken else self.action_key
+        self.decoded_key = unravel_key(decoded_key)
         if self.executed_key in (self.synergy_key, self.action_key):
             raise ValueError(
                 f"executed_key is {self.executed_key!r}, which already names the synergy or the "
                 "action; choose a key of its own, such as 'executed_action'."
+            )
+        if self.decoded_key in (self.synergy_key, self.executed_key):
+            raise ValueError(
+                f"decoded_key is {self.decoded_key!r}, which already names the synergy or the "
+                "executed action; choose a key of its own, such as 'decoded_action'."
             )
 
     def _in_keys_inv(self) -> list[NestedKey]:
@@ -113,13 +139,10 @@ class SynergyAction(ModuleTransform):
         return [self.synergy_key]
 
     @property
-    def _decoded_key(self) -> NestedKey:
+    def _decoded_copy(self) -> NestedKey:
         # Seen by ``_step`` only. The action key will not do: an inner transform, such as an action
         # scaling, rewrites it on the way to the env.
-        *prefix, name = (
-            (self.executed_key,) if isinstance(self.executed_key, str) else self.executed_key
-        )
-        return unravel_key((*prefix, f"_{name}"))
+        return private_key(self.executed_key, self.decoded_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         synergy = tensordict.get(self.synergy_key, None)
@@ -132,7 +155,7 @@ class SynergyAction(ModuleTransform):
             )
         action = self.decode(synergy)
         tensordict.set(self.action_key, action)
-        return tensordict.set(self._decoded_key, action)
+        return tensordict.set(self._decoded_copy, action)
 
     @torch.no_grad()
     def decode(self, synergy: Tensor) -> Tensor:
@@ -149,9 +172,19 @@ class SynergyAction(ModuleTransform):
         )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        # ``tensordict`` is the copy that the inverse pass worked on: the caller's never holds the
-        # decoded action.
-        return next_tensordict.set(self.executed_key, tensordict.get(self._decoded_key))
+        # ``tensordict`` is the copy that the inverse passes of all transforms worked on.
+        decoded = tensordict.get(self._decoded_copy)
+        if isinstance(self.collector, Collector):
+            # The copy's root is lost, and so is that of the step where a collector takes data from
+            # device to device; this is the one that it stores.
+            self.collector._carrier.set(self.decoded_key, decoded)
+        executed = decoded if self._base_key is None else tensordict.get(self._base_key)
+        return next_tensordict.set(self.executed_key, executed.to(self._executed_leaf.dtype))
+
+    def transform_fake_tensordict(self, fake_tensordict: TensorDictBase) -> TensorDictBase:
+        if isinstance(self.collector, Collector):
+            fake_tensordict.set(self.decoded_key, self._action_leaf.zero())
+        return fake_tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -163,7 +196,7 @@ class SynergyAction(ModuleTransform):
     ) -> TensorDictBase:
         # Here nobody merges by the reset mask for us.
         rest = self.rest(tensordict_reset.batch_size)
-        reset = tensordict.get(self.parent.reset_keys[0]).reshape(tensordict.batch_size)
+        reset = group_reset(self.parent, tensordict, self.executed_key)
         present = tensordict.get(self.executed_key)
         return tensordict_reset.set(
             self.executed_key, torch.where(expand_as_right(reset, rest), rest, present)
@@ -171,7 +204,7 @@ class SynergyAction(ModuleTransform):
 
     def rest(self, batch_size: torch.Size) -> Tensor:
         """What counts as executed before the first step: zeros brought into the bounds."""
-        leaf = self._action_leaf
+        leaf = self._executed_leaf
         rest = leaf.zero()
         if isinstance(leaf, Bounded):
             rest = rest.clamp(leaf.space.low, leaf.space.high)
@@ -182,17 +215,45 @@ class SynergyAction(ModuleTransform):
     def _action_leaf(self) -> TensorSpec:
         return self.parent.full_action_spec[self.action_key]
 
+    @property
+    def _base_key(self) -> NestedKey | None:
+        """The simulator's name for the action, or None where that is not known."""
+        keys = self.parent.base_env.action_keys
+        if self.action_key in keys:
+            return self.action_key
+        return keys[0] if len(keys) == 1 else None
+
+    @property
+    def _executed_leaf(self) -> TensorSpec:
+        key = self._base_key
+        return self._action_leaf if key is None else self.parent.base_env.full_action_spec[key]
+
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         leaf = action_spec[self.action_key]
         synergy_spec = self.module.synergy_spec
         synergy_spec = synergy_spec.expand(*leaf.shape[:-1], *synergy_spec.shape)
-        action_spec = _without(action_spec, self.action_key)
-        action_spec[self.synergy_key] = synergy_spec.to(leaf.device or synergy_spec.device)
-        return action_spec
+        synergy_spec = synergy_spec.to(leaf.device or synergy_spec.device)
+        # In this order: a group that were empty for a moment would lose its batch size.
+        set_leaf(action_spec, self.synergy_key, synergy_spec, self.parent)
+        return (
+            action_spec
+            if self.synergy_key == self.action_key
+            else _without(action_spec, self.action_key)
+        )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec[self.executed_key] = self._action_leaf.clone()
+        set_leaf(observation_spec, self.executed_key, self._executed_leaf.clone(), self.parent)
         return observation_spec
+
+    def __repr__(self) -> str:
+        decoder = self.module
+        return (
+            f"{type(self).__name__}({type(decoder).__name__} of "
+            f"{decoder.synergy_spec.shape[-1]} numbers into {decoder.action_dim} actuators in "
+            f"{_interval(decoder.low, decoder.high)}, synergy_key={self.synergy_key!r}, "
+            f"action_key={self.action_key!r}, executed_key={self.executed_key!r}, "
+            f"decoded_key={self.decoded_key!r})"
+        )
 
     def set_container(self, container: Transform | EnvBase) -> None:
         _refuse_replay_buffer()
@@ -224,6 +285,15 @@ class SynergyAction(ModuleTransform):
                     f"{key!r} is an observation of the env already; give SynergyAction another "
                     "synergy_key or executed_key."
                 )
+        if isinstance(env.base_env, TransformedEnv) and self.action_key in (
+            unravel_key(key) for key in env.base_env.transform.in_keys_inv or ()
+        ):
+            warnings.warn(
+                f"The transforms of an inner environment rewrite {self.action_key!r} out of the "
+                f"sight of SynergyAction, so that {self.executed_key!r} is not what the simulator "
+                "executes; append SynergyAction to that environment instead.",
+                stacklevel=2,
+            )
         leaf, decoder = actions[self.action_key], self.module
         if not isinstance(leaf, Bounded | Unbounded):
             raise ValueError(
@@ -256,6 +326,10 @@ def _without(spec: Composite, key: NestedKey) -> Composite:
         key = unravel_key(key[:-1])
         del spec[key]
     return spec
+
+
+def _beside(key: NestedKey, name: str) -> NestedKey:
+    return name if isinstance(key, str) else unravel_key((*key[:-1], name))
 
 
 def _interval(low: Tensor, high: Tensor) -> str:

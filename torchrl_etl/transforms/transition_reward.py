@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
+
+from torchrl_etl.transforms.keys import (
+    group_reset,
+    private_key,
+    refuse_shared_keys,
+    set_leaf,
+)
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
 
 __all__ = ["TransitionReward", "evaluate"]
 
@@ -18,23 +30,41 @@ __all__ = ["TransitionReward", "evaluate"]
 class TransitionReward(Transform):
     """Writes rewards below ``"next"`` that depend on both ends of a step.
 
-    A subclass computes them in ``_rewards``, one for each out-key. They are declared as [*, 1], of
-    the dtype of the last observation that is read.
+    The first in-key is the observation that is compared. In an environment, transforms behind this
+    one may rewrite it (a normalization, say, perhaps in another process), and then the root of a
+    step and what arrives below ``"next"`` are not of one kind. So the transform carries a copy of
+    its own from reset to step, under a private key, which collectors leave out of their batches.
+
+    A subclass computes the rewards in ``_rewards``, one for each out-key. They are declared as
+    [*, 1], of the dtype of ``_typed_by``.
     """
 
     _cure: str
     """How to mend that an observation is missing in an environment."""
 
     @property
-    def _observed(self) -> Sequence[NestedKey]:
-        """Those in-keys that are observations."""
-        return self.in_keys
+    def _carried(self) -> Sequence[NestedKey]:
+        """In-keys besides the first that are observations."""
+        return ()
+
+    @property
+    @abstractmethod
+    def _typed_by(self) -> NestedKey:
+        """An observation or a reward whose dtype the rewards have."""
 
     @abstractmethod
     def _rewards(
-        self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        tensordict: TensorDictBase,
+        next_tensordict: TensorDictBase,
     ) -> tuple[Tensor, ...]:
         """The rewards [*, 1], in the order of the out-keys."""
+
+    @property
+    def _copy_key(self) -> NestedKey:
+        return private_key(self.out_keys[0], self.in_keys[0])
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
         value = tensordict.get(key, None)
@@ -52,48 +82,93 @@ class TransitionReward(Transform):
                 f"{type(self).__name__} needs whole transitions, but the tensordict has no 'next' "
                 "entry; call it on data from a rollout, a collector or a replay buffer."
             )
-        rewards = self._rewards(tensordict, next_tensordict)
+        # Both ends have passed the same transforms here.
+        key = self.in_keys[0]
+        ends = self._read(tensordict, key), self._read(next_tensordict, key, "next")
+        rewards = self._rewards(*ends, tensordict, next_tensordict)
         for key, value in zip(self.out_keys, rewards, strict=True):
             tensordict.set(unravel_key(("next", key)), value)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        rewards = self._rewards(tensordict, next_tensordict)
+        self._keep(next_tensordict)
+        ends = self._read(tensordict, self._copy_key), next_tensordict.get(self._copy_key)
+        rewards = self._rewards(*ends, tensordict, next_tensordict)
         for key, value in zip(self.out_keys, rewards, strict=True):
             next_tensordict.set(key, value)
         return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        self._leaf(self.in_keys[0])  # raises with a cure if the environment has no such key
+        return self._keep(tensordict_reset)
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Here nobody merges by the reset mask for us.
+        fresh = self._read(tensordict_reset, self.in_keys[0])
+        reset = group_reset(self.parent, tensordict, self._copy_key)
+        present = tensordict.get(self._copy_key)
+        kept = torch.where(expand_as_right(reset, fresh), fresh, present)
+        return tensordict_reset.set(self._copy_key, kept)
+
+    def _keep(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set(self._copy_key, self._read(tensordict, self.in_keys[0]).clone())
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        if self.parent is not None:
+            try:
+                refuse_shared_keys(self, self.parent.output_spec, self.out_keys)
+            except ValueError:
+                self.reset_parent()
+                raise
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        refuse_shared_keys(self, output_spec, self.out_keys)
+        return super().transform_output_spec(output_spec)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        leaf = self._leaf(self.in_keys[0]).clone()
+        set_leaf(observation_spec, self._copy_key, leaf, self.parent)
+        return observation_spec
 
     def transform_state_spec(self, state_spec: Composite | None) -> Composite:
         # A parallel env hands its workers the action and what the state spec names, no more:
         # without these entries a worker would take the root of its own last step for the caller's.
         if state_spec is None:
             state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
-        for key in self._observed:
+        set_leaf(state_spec, self._copy_key, self._leaf(self.in_keys[0]).clone(), self.parent)
+        for key in self._carried:
             if key not in state_spec.keys(True, True):
-                state_spec[key] = self._observation_leaf(key).clone()
+                set_leaf(state_spec, key, self._leaf(key).clone(), self.parent)
         return state_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        leaf = self._observation_leaf(self._observed[-1])
+        observation, typed = self._leaf(self.in_keys[0]), self._leaf(self._typed_by)
         for key in self.out_keys:
-            reward_spec[key] = Unbounded(
-                shape=(*leaf.shape[:-1], 1), dtype=leaf.dtype, device=leaf.device
+            leaf = Unbounded(
+                shape=(*observation.shape[:-1], 1), dtype=typed.dtype, device=typed.device
             )
+            set_leaf(reward_spec, key, leaf, self.parent)
         return reward_spec
 
-    def _observation_leaf(self, key: NestedKey) -> Unbounded:
-        observation_spec = self.parent.full_observation_spec
-        if key not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"{type(self).__name__} reads {key!r}, but the env's observations are "
-                f"{sorted(map(str, observation_spec.keys(True, True)))}; {self._cure}"
-            )
-        return observation_spec[key]
+    def _leaf(self, key: NestedKey) -> TensorSpec:
+        for spec in (self.parent.full_observation_spec, self.parent.full_reward_spec):
+            if key in spec.keys(True, True):
+                return spec[key]
+        observed = sorted(map(str, self.parent.full_observation_spec.keys(True, True)))
+        raise KeyError(
+            f"{type(self).__name__} reads {key!r}, but the env's observations are {observed}; "
+            f"{self._cure}"
+        )
 
 
 def evaluate(network: TensorDictModuleBase, *inputs: Tensor) -> Tensor:
-    """The network's output for bare tensors, computed on the network's own device."""
-    device = next(iter(network.parameters()), inputs[0]).device
-    entries = dict(zip(network.in_keys, inputs, strict=True))
-    written = network(TensorDict(entries, inputs[0].shape[:-1], device=device))
+    """The network's output for bare tensors, computed on the network's own device and dtype."""
+    weight = next(iter(network.parameters()), inputs[0])
+    entries = {key: value.to(weight) for key, value in zip(network.in_keys, inputs, strict=True)}
+    written = network(TensorDict(entries, inputs[0].shape[:-1], device=weight.device))
     return written.get(network.out_keys[0])

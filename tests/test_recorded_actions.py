@@ -1,0 +1,109 @@
+"""Arrays of recorded actions, as people bring them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules.recorded_actions import as_actions
+from torchrl_etl.synergies import fit_gmvae
+
+ACTIONS = np.tanh(np.random.default_rng(0).normal(size=(64, 2)) @ np.ones((2, 4)))
+WITH_NAN = ACTIONS.copy()
+WITH_NAN[[3, 7], 1] = np.nan
+
+
+def gmvae() -> GMVAE:
+    torch.manual_seed(0)
+    return GMVAE(4, 2, hidden=(8,))
+
+
+def uses():
+    """Whoever takes recorded actions, with one signature."""
+    yield "fit_gmvae", lambda model, actions: fit_gmvae(model, actions, updates=2)
+    yield "from_gmvae", lambda model, actions: SynergyDecoder.from_gmvae(model, actions)
+    yield "encode", lambda model, actions: SynergyDecoder(2, 4).encode(model, actions)
+
+
+USES = [pytest.param(use, id=name) for name, use in uses()]
+
+
+def numbers(made) -> torch.Tensor:
+    tensors = [made] if isinstance(made, torch.Tensor) else made.state_dict().values()
+    return torch.cat([tensor.flatten() for tensor in tensors])
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param(ACTIONS, id="NumPy, double"),
+        pytest.param(torch.from_numpy(ACTIONS), id="double"),
+        pytest.param(ACTIONS.tolist(), id="lists"),
+        pytest.param(ACTIONS.astype(np.float16).astype(np.float32)[::-1][::-1], id="strided"),
+        pytest.param(ACTIONS.reshape(8, 8, 4), id="by episode"),
+    ],
+)
+def test_arrays_of_any_kind_give_the_numbers_of_the_tensor(use, given):
+    reference = torch.as_tensor(np.asarray(given)).float()
+    torch.manual_seed(1)
+    expected = numbers(use(gmvae(), reference))
+    torch.manual_seed(1)
+    assert torch.equal(numbers(use(gmvae(), given)), expected)
+    assert expected.isfinite().all()
+
+
+@pytest.mark.parametrize("use", USES)
+def test_integers_and_constant_columns_give_finite_numbers(use):
+    integers = np.sign(ACTIONS).astype(np.int64)
+    assert numbers(use(gmvae(), integers)).isfinite().all()
+    constant = ACTIONS.copy()
+    constant[:, 2] = 0.3
+    assert numbers(use(gmvae(), constant)).isfinite().all()
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        (ACTIONS[:, :3], ValueError, r"shape \(64, 3\), but there are 4 actuators; pass an array"),
+        (ACTIONS[:, 0], ValueError, "but there are 4 actuators"),
+        (WITH_NAN, ValueError, "NaN or infinity in 2 of 64 rows, the first in row 3"),
+        (100 * ACTIONS, ValueError, r"bounds are \[-1, 1\]; bring the actions to these units"),
+        (np.array([["a"] * 4]), TypeError, "no array of real numbers"),
+        (ACTIONS * 1j, TypeError, "complex"),
+    ],
+)
+def test_what_cannot_be_converted_is_refused_in_a_sentence(use, given, error, message):
+    model = gmvae()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with pytest.raises(error, match=message):
+        use(model, given)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.parametrize("use", USES[:2])
+def test_one_row_is_refused_and_rows_all_alike_are_warned_of_where_synergies_are_sought(use):
+    with pytest.raises(ValueError, match=r"1 row\(s\), in which no synergies"):
+        use(gmvae(), ACTIONS[:1])
+    with pytest.warns(UserWarning, match="9 actions are all alike"):
+        assert numbers(use(gmvae(), np.zeros((9, 4)))).isfinite().all()
+
+
+def test_one_action_is_enough_to_encode():
+    assert SynergyDecoder(2, 4).encode(gmvae(), ACTIONS[0]).shape == (2,)
+
+
+def test_a_small_overshoot_of_the_bounds_is_taken():
+    low, high = torch.zeros(4), torch.ones(4)
+    assert as_actions(np.full((1, 4), 1.05), low=low, high=high).max() > 1
+    with pytest.raises(ValueError, match=r"between 1\.2 and 1\.2"):
+        as_actions(np.full((1, 4), 1.2), low=low, high=high)
+
+
+def test_more_rows_than_a_quantile_takes():
+    actions = torch.rand(9_000_000, 2)
+    decoder = SynergyDecoder.from_gmvae(GMVAE(2, 2, 1, hidden=(2,)), actions)
+    assert decoder.module.scale.isfinite().all()

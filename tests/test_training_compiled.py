@@ -1,0 +1,122 @@
+"""Whatever stops a compilation costs one sentence; the numbers are those of an uncompiled run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from torch._inductor.utils import fresh_cache
+
+from tests.configs import ROOT, tiny
+from tests.test_training_resume import numbers
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.training import resumed_config
+from torchrl_etl.training.checkpoints import Checkpoints
+
+NOWHERE = {"cpp.cxx": (None, "/nowhere/g++")}
+
+
+def slope(x: torch.Tensor) -> torch.Tensor:
+    noise = torch.randn(4)
+    return torch.autograd.grad((x.exp() * noise).sum(), x)[0]
+
+
+def an_operation_unknown_to_the_compiler(x: torch.Tensor) -> torch.Tensor:
+    torch._dynamo.graph_break()
+    return slope(x)
+
+
+@pytest.mark.parametrize(
+    ("function", "patch", "words"),
+    [
+        (slope, NOWHERE, r"no C\+\+ compiler \(/nowhere/g\+\+ does not run\); install one"),
+        (slope, {"cpp.cxx": (None, "false")}, "no C"),
+        (an_operation_unknown_to_the_compiler, {}, "compile=false leaves out the attempt"),
+    ],
+)
+def test_a_failed_compilation_says_why_and_gives_the_uncompiled_numbers(function, patch, words):
+    x = torch.linspace(-1, 1, 4, requires_grad=True)
+    call = compiled(function)
+    outs = []
+    torch._dynamo.reset()
+    with fresh_cache(), torch._inductor.config.patch(patch):
+        torch.manual_seed(0)
+        with pytest.warns(RuntimeWarning, match=f"^Updates run uncompiled.*{words}"):
+            outs.append(call(x))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            outs.append(call(x))  # says nothing a second time
+    torch.manual_seed(0)
+    assert torch.equal(torch.stack(outs), torch.stack([function(x), function(x)]))
+
+
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="a folder nobody can write to")
+def test_a_cache_that_cannot_be_written_is_named_with_the_variable_that_moves_it(monkeypatch):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/sys/kernel")
+    torch._dynamo.reset()
+    x = torch.linspace(-1, 1, 4, requires_grad=True)
+    with pytest.warns(RuntimeWarning, match=r"/sys/kernel.*TORCHINDUCTOR_CACHE_DIR"):
+        assert compiled(slope)(x).shape == (4,)
+
+
+@pytest.mark.slow
+def test_a_run_that_cannot_compile_has_the_numbers_of_an_uncompiled_one_and_resumes(
+    tmp_path, monkeypatch
+):
+    plain, broken = tmp_path / "plain", tmp_path / "broken"
+    settings = ("method=sac", "learn.frames=608")
+    Experiment(tiny(*settings, f"run_dir='{plain}'", "compile=false")).run()
+
+    save = Checkpoints.save
+
+    def save_and_die(self, checkpoint, *, step, **kwargs):
+        save(self, checkpoint, step=step, **kwargs)
+        raise ZeroDivisionError("as good as killed")
+
+    with fresh_cache(), torch._inductor.config.patch(NOWHERE):
+        monkeypatch.setattr(Checkpoints, "save", save_and_die)
+        with (
+            pytest.warns(RuntimeWarning, match="Updates run uncompiled"),
+            pytest.raises(ZeroDivisionError),
+        ):
+            Experiment(tiny(*settings, f"run_dir='{broken}'", "compile=true")).run()
+        monkeypatch.undo()
+        Experiment(resumed_config(broken), resume=broken).run()
+    assert numbers(broken) == numbers(plain)
+
+
+COMPILE = """
+import warnings, torch
+from torchrl_etl.learners.compiled import compiled
+warnings.simplefilter("error", RuntimeWarning)
+print(torch.__file__)
+x = torch.ones(3, requires_grad=True)
+print(compiled(lambda x: torch.autograd.grad(x.square().sum(), x)[0])(x))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="folders are linked as on Linux")
+def test_a_library_and_a_cache_in_folders_with_spaces_compile(tmp_path):
+    spaced = tmp_path / "my folder"
+    spaced.mkdir()
+    (spaced / "site").symlink_to(Path(torch.__file__).parents[1])
+    environment = os.environ | {
+        "PYTHONPATH": f"{spaced / 'site'}:{ROOT}",
+        "TMPDIR": str(spaced),
+        "TORCHINDUCTOR_CACHE_DIR": str(spaced / "cache"),
+    }
+    ran = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", COMPILE],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    assert str(spaced) in ran.stdout and "tensor([2., 2., 2.])" in ran.stdout

@@ -1,0 +1,98 @@
+"""Arrays of recorded actions, as files and NumPy hold them, made fit for a GMVAE."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["as_actions"]
+
+# Recordings overshoot their bounds a little: filters ring, and estimates are noisy.
+OVERSHOOT = 0.1
+
+
+def as_actions(
+    actions: Tensor | np.ndarray | Sequence[Any],
+    *,
+    low: Tensor,
+    high: Tensor,
+    min_rows: int = 0,
+) -> Tensor:
+    """Recorded actions as a tensor of the dtype and on the device of the bounds.
+
+    Integers, double precision, NumPy arrays and lists are converted.
+
+    Args:
+        actions (array): [*, n], in action units.
+
+    Keyword Args:
+        low, high (Tensor): action bounds [n]. Values may pass them by a tenth of the range.
+        min_rows (int): with more than 0, ``actions`` must have that many rows, and is returned as
+            [N, n], with a warning if all are alike. Default: 0.
+
+    Raises:
+        TypeError: if the actions are not real numbers.
+        ValueError: if the last size is not n, a value is not finite or far outside of the bounds,
+            or rows are too few.
+
+    Examples:
+        >>> import numpy as np
+        >>> low, high = torch.zeros(3), torch.ones(3)
+        >>> as_actions(np.full((2, 3), 0.5), low=low, high=high).dtype
+        torch.float32
+        >>> as_actions(np.ones((2, 4)), low=low, high=high)
+        Traceback (most recent call last):
+        ...
+        ValueError: The actions have shape (2, 4), but there are 3 actuators; pass an array [N, 3].
+    """
+    try:
+        found = torch.as_tensor(actions)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(
+            f"The actions are a {type(actions).__name__} that is no array of real numbers; pass "
+            f"an array [N, {len(low)}]."
+        ) from error
+    if found.is_complex():
+        raise TypeError(f"The actions are {found.dtype}; pass an array [N, {len(low)}] of reals.")
+    if found.ndim == 0 or found.shape[-1] != len(low):
+        raise ValueError(
+            f"The actions have shape {tuple(found.shape)}, but there are {len(low)} actuators; "
+            f"pass an array [N, {len(low)}]."
+        )
+    found = found.to(low)
+    rows = found.detach().reshape(-1, len(low))
+    _check_values(rows, low, high)
+    if not min_rows:
+        return found
+    if len(rows) < min_rows:
+        raise ValueError(
+            f"The actions have {len(rows)} row(s), in which no synergies can be found; pass at "
+            f"least {min_rows} different actions, [N, {len(low)}]."
+        )
+    if bool((rows == rows[0]).all()):
+        warnings.warn(
+            f"The {len(rows)} actions are all alike, so there are no synergies in them.",
+            stacklevel=3,
+        )
+    return rows
+
+
+def _check_values(rows: Tensor, low: Tensor, high: Tensor) -> None:
+    broken = ~torch.isfinite(rows).all(-1)
+    if broken.any():
+        raise ValueError(
+            f"The actions have NaN or infinity in {int(broken.sum())} of {len(rows)} rows, the "
+            f"first in row {int(broken.nonzero()[0])}; leave these rows out."
+        )
+    margin = OVERSHOOT * (high - low)
+    if ((rows < low - margin) | (rows > high + margin)).any():
+        raise ValueError(
+            f"The actions lie between {rows.min():g} and {rows.max():g}, but the bounds are "
+            f"[{low.min():g}, {high.max():g}]; bring the actions to these units, or build the "
+            "GMVAE with low= and high= of theirs."
+        )

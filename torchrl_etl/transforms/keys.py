@@ -1,0 +1,121 @@
+"""Where a transform's key lies in an environment, and who else writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, expand_right, unravel_key
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, TensorDictPrimer, Transform
+
+__all__ = ["group_reset", "group_shape", "private_key", "refuse_shared_keys", "set_leaf"]
+
+
+def group_shape(env: EnvBase, key: NestedKey) -> torch.Size:
+    """Batch size of the group (of agents, say) that ``key`` lies in, the environment's without one.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> group_shape(GymEnv("Pendulum-v1"), ("agents", "direction"))
+        torch.Size([])
+    """
+    shape = env.batch_size
+    if isinstance(key, str):
+        return shape
+    for spec in (env.full_observation_spec, env.full_action_spec, env.full_reward_spec):
+        for node in _groups(spec, key):
+            shape = max(shape, node.shape, key=len)
+    return shape
+
+
+def set_leaf(spec: Composite, key: NestedKey, leaf: TensorSpec, env: EnvBase) -> None:
+    """Declare a leaf; groups that ``spec`` lacks get the batch size that they have elsewhere."""
+    path = (key,) if isinstance(key, str) else key
+    for depth in range(1, len(path)):
+        group = unravel_key(path[:depth])
+        if group not in spec.keys(True):
+            shape = group_shape(env, (*path[:depth], ""))
+            spec[group] = Composite(shape=shape, device=spec.device)
+    spec[key] = leaf
+
+
+def group_reset(env: EnvBase, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
+    """Which elements of the group of ``key`` begin a new episode, a mask of the group's shape."""
+    path = (key,) if isinstance(key, str) else key
+    own = [
+        reset_key
+        for reset_key in env.reset_keys
+        if isinstance(reset_key, str) or reset_key[:-1] == path[: len(reset_key) - 1]
+    ]
+    reset_key = max(own, key=lambda found: 0 if isinstance(found, str) else len(found))
+    mask = tensordict.get(reset_key).reshape(group_shape(env, reset_key))
+    return expand_right(mask, group_shape(env, key))
+
+
+def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
+    """A key beside ``key`` for what ``owner`` alone reads; collectors leave it out of batches.
+
+    Examples:
+        >>> private_key("bonus", ("agents", "observation"))
+        ('agents', '_bonus_observation')
+    """
+    *group, name = (key,) if isinstance(key, str) else key
+    owner = owner if isinstance(owner, str) else owner[-1]
+    return unravel_key((*group, f"_{owner}_{name}"))
+
+
+def refuse_shared_keys(
+    transform: Transform, output_spec: Composite, keys: Iterable[NestedKey]
+) -> None:
+    """Raise if a key is in the spec already, or if a transform that comes later writes it too.
+
+    A later transform may rewrite what it reads, as scalings and normalizations do.
+
+    Raises:
+        ValueError: naming the key and who writes it.
+    """
+    name = type(transform).__name__
+    cure = f"give one of them another key, such as {name}(..., out_key=...)."
+    present = {
+        key
+        for kind in ("full_observation_spec", "full_reward_spec")
+        for key in output_spec[kind].keys(True, True)
+    }
+    for key in keys:
+        if key in present:
+            raise ValueError(
+                f"{name} writes {key!r}, which the environment or a transform before it writes "
+                f"already; {cure}"
+            )
+        for other in _later(transform):
+            if key in _writes(other) and key not in (other.in_keys or ()):
+                raise ValueError(
+                    f"{name} and {type(other).__name__} both write {key!r}, and the later one "
+                    f"would overwrite the other; {cure}"
+                )
+
+
+def _groups(spec: Composite, key: tuple[str, ...]) -> Iterator[Composite]:
+    """The nodes of a spec on the way to ``key``."""
+    for name in key[:-1]:
+        if not isinstance(spec, Composite) or name not in spec.keys():
+            return
+        spec = spec[name]
+        yield spec
+
+
+def _writes(transform: Transform) -> set[NestedKey]:
+    own = transform.primers.keys(True, True) if isinstance(transform, TensorDictPrimer) else ()
+    return {unravel_key(key) for key in (*own, *(transform.out_keys or ()))}
+
+
+def _later(transform: Transform) -> Iterator[Transform]:
+    """Those after it in its ``Compose``; the ones before it have declared their keys."""
+    reference = transform.__dict__.get("_container")
+    container = reference() if reference is not None else None
+    if isinstance(container, Compose):
+        siblings = list(container.transforms)
+        yield from siblings[[other is transform for other in siblings].index(True) + 1 :]
