@@ -29,6 +29,8 @@ _CHOICES = {
     "learn.buffer_storage": ("memory", "memmap"),
     "learn.fine_tuning": ("critic", "reconstruction", "frozen"),
     "learn.sac.noise": ("independent", "held"),
+    "explore.sac.loss_function": ("l2", "l1", "smooth_l1"),
+    "learn.sac.loss_function": ("l2", "l1", "smooth_l1"),
     **{
         f"{section}{network}.body": get_args(Body)
         for section in ("", "explore.", "learn.")

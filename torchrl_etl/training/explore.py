@@ -69,7 +69,8 @@ class ExploreStage(Stage):
             :class:`~torchrl_etl.transforms.IntrinsicReward`,
             :class:`~torchrl_etl.objectives.BehavioralMetricLoss`,
             :class:`~torchrl_etl.modules.GMVAE`, and of SAC (``gamma``, ``tau``, ``lr``,
-            ``alpha_init``, ``action_std``).
+            ``alpha_init``, ``action_std``,
+            ``loss_function``).
         redraw (float): ``share`` of :class:`~torchrl_etl.transforms.RedrawDirection`.
         fit (mapping): how the GMVAE is trained: ``actions`` ("policy", "mean", "sampled" or
             "activation"), ``best_share`` (share of each batch, by task reward, that it sees),
@@ -132,6 +133,7 @@ class ExploreStage(Stage):
             action_spec=action_spec,
             target_entropy=entropy_target(action_spec, sac["action_std"]),
             alpha_init=sac["alpha_init"],
+            loss_function=sac["loss_function"],
         ).to(device)
         self.sac.set_keys(reward="intrinsic_reward")
         self.targets = [ready_for_training(self.sac, gamma=sac["gamma"], tau=sac["tau"])]

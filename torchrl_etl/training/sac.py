@@ -47,7 +47,8 @@ class SACStage(Stage):
         actor, critic (mapping): keyword arguments of :func:`~torchrl_etl.modules.make_actor` and
             :func:`~torchrl_etl.modules.make_critic`.
         sac (mapping): ``gamma``, ``tau``, ``lr``, ``alpha_init``, ``action_std`` (see
-            :func:`~torchrl_etl.training.stage.entropy_target`), ``return_bound`` (scale rewards as
+            :func:`~torchrl_etl.training.stage.entropy_target`), ``loss_function`` (of scalar
+            critics: "l2", "l1" or "smooth_l1"), ``return_bound`` (scale rewards as
             :class:`~torchrl_etl.modules.ReturnScale` does; ``None``: as they are), ``noise``
             ("independent" at every step or "held" for several), ``hold`` (keyword arguments of
             :class:`~torchrl_etl.modules.HeldNoise`), ``normalize_observations`` (actor and
@@ -119,6 +120,7 @@ class SACStage(Stage):
             target_entropy=self.target_entropy(sac["action_std"]),
             alpha_init=sac["alpha_init"],
             num_qvalue_nets=sac["num_critics"],
+            loss_function=sac["loss_function"],
             support=support(critic.get("bins", 1), bound),
         ).to(device)
         self.sac.set_keys(reward=self.reward)
