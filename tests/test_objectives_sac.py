@@ -143,7 +143,7 @@ def test_a_critic_of_terminal_transitions_has_the_fixed_point_of_its_loss_functi
     optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=0.01)
     for _ in range(800):
         optimizer.zero_grad()
-        loss(data)["loss_qvalue"].backward()
+        loss.qvalue_v2_loss(data)[0].backward()
         optimizer.step()
     with torch.no_grad():
         values = loss._outputs(data, loss._weights("qvalue_network"))
