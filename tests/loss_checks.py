@@ -31,6 +31,7 @@ class LossChecks(ABC):
         targets: names of the target networks, such as ``target_encoder_params``.
         per_sample: outputs that have the batch's shape under ``reduction="none"``.
         optional_keys: in keys that a batch may lack.
+        vmapped: ``False`` where the policy's distribution draws as ``torch.vmap`` cannot.
         recorded: in keys that are data and targets to the loss: no gradient may flow into them.
     """
 
@@ -40,6 +41,7 @@ class LossChecks(ABC):
     per_sample: ClassVar[set[str] | None] = None
     optional_keys: ClassVar[set[NestedKey]] = set()
     recorded: ClassVar[set[NestedKey]] = set()
+    vmapped: ClassVar[bool] = True
 
     @abstractmethod
     def make_loss(self, *, nested: bool = False, **kwargs: Any) -> LossModule:
@@ -248,6 +250,58 @@ class LossChecks(ABC):
         data = data.apply(lambda x: x.double() if x.is_floating_point() else x)
         out = self.losses(loss(data))
         assert {value.dtype for value in out.values()} == {torch.float64}
+
+    # Several seeds at once
+
+    def test_vmap_over_stacked_parameters_gives_what_single_losses_give(self) -> None:
+        if not self.vmapped:
+            pytest.skip("draws as torch.vmap cannot")
+        losses = [self.built() for _ in range(3)]
+        for parameter in (p for loss in losses for p in loss.parameters()):
+            parameter.data += 0.05 * torch.randn_like(parameter)
+        singles = [dict(TensorDict.from_module(loss).items(True, True)) for loss in losses]
+        stacked = {key: torch.stack([one[key].data for one in singles]) for key in singles[0]}
+        trained = {key for key, value in singles[0].items() if value.requires_grad}
+        data = torch.stack([self.make_data() for _ in losses])
+
+        def total(weights: Any, fixed: Any, batch: TensorDict) -> Any:
+            with TensorDict(fixed | weights).to_module(losses[0]):
+                out = self.losses(losses[0](batch))
+            return sum(out.values()), out
+
+        weights = {key: stacked.pop(key) for key in trained}
+        # Every seed draws the same numbers, those of a single loss.
+        gradient = torch.vmap(torch.func.grad(total, has_aux=True), randomness="same")
+        gradients, outs = self.seeded(gradient, weights, stacked, data)
+        for i, (loss, single) in enumerate(zip(losses, singles, strict=True)):
+            out = self.losses(self.seeded(loss, data[i].clone()))
+            sum(out.values()).backward()
+            for key, value in out.items():
+                torch.testing.assert_close(outs[key][i], value.detach(), rtol=1e-4, atol=1e-5)
+            for key in trained:
+                expected = single[key].grad
+                expected = torch.zeros_like(single[key]) if expected is None else expected
+                torch.testing.assert_close(gradients[key][i], expected, rtol=1e-3, atol=1e-5)
+
+    def test_vmap_with_different_randomness_draws_for_every_seed(self) -> None:
+        """Equal seeds differ in their draws alone; a loss without draws gives equal numbers."""
+        if not self.vmapped:
+            pytest.skip("draws as torch.vmap cannot")
+        loss, data = self.built(), self.data()
+        draws = not all(
+            torch.equal(first, second)
+            for first, second in zip(
+                self.losses(loss(data.clone())).values(),
+                self.losses(loss(data.clone())).values(),
+                strict=True,
+            )
+        )
+
+        def forward(batch: TensorDict) -> TensorDict:
+            return TensorDict(self.losses(loss(batch)))
+
+        out = torch.vmap(forward, randomness="different")(data.expand(2, *data.shape).clone())
+        assert draws == any((value[0] != value[1]).any() for value in out.values())
 
     def test_parameters_can_be_drawn_anew(self) -> None:
         loss = self.built()

@@ -279,6 +279,7 @@ def test_acts_on_bare_arrays_as_the_vector_collector_has_them() -> None:
 class TestDynSynSAC(synergy.TestSynergySACLoss):
     """LeanSACLoss on a DynSyn actor passes the check list of losses."""
 
+    vmapped = False
     default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
     trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
 

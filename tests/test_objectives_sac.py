@@ -55,10 +55,16 @@ class TestLeanSACLoss(synergy.TestSynergySACLoss):
 @pytest.mark.parametrize(
     "options",
     [
-        {},
+        {"loss_function": "smooth_l1"},
         {"loss_function": "l2", "alpha_init": 0.3, "num_qvalue_nets": 3},
-        {"fixed_alpha": True, "delay_qvalue": False, "reduction": "sum"},
-        {"reduction": "none", "scalar_output_mode": "exclude", "min_alpha": 0.5, "max_alpha": 2.0},
+        {"loss_function": "l1", "fixed_alpha": True, "delay_qvalue": False, "reduction": "sum"},
+        {
+            "loss_function": "l2",
+            "reduction": "none",
+            "scalar_output_mode": "exclude",
+            "min_alpha": 0.5,
+            "max_alpha": 2.0,
+        },
     ],
 )
 def test_values_and_gradients_are_those_of_torchrls_loss(options: dict[str, Any]) -> None:
@@ -119,3 +125,42 @@ def test_targets_move_as_with_torchrls_updater(rate: dict[str, float]) -> None:
     assert any(key.startswith("target_") for key in ours)
     for key, value in theirs.items():
         torch.testing.assert_close(ours[key], value)
+
+
+@pytest.mark.parametrize(
+    ("options", "fixed_point"), [({}, 10.0), ({"loss_function": "smooth_l1"}, 1 / 9)]
+)
+def test_a_critic_of_terminal_transitions_has_the_fixed_point_of_its_loss_function(
+    options: dict[str, Any], fixed_point: float
+) -> None:
+    """One in ten pays 100: the mean is 10; smooth-L1's minimum is where 9 q = 1."""
+    torch.manual_seed(SEED)
+    loss = make_loss(**options)
+    SoftUpdate(loss, tau=0.1)
+    data = TestLeanSACLoss().data((1,)).expand(10).clone()
+    data["next", "reward"] = 100.0 * (torch.arange(10) == 0).float().unsqueeze(-1)
+    data["next", "done"] = data["next", "terminated"] = torch.ones(10, 1, dtype=torch.bool)
+    optimizer = torch.optim.Adam(loss.qvalue_network_params.parameters(), lr=0.01)
+    for _ in range(800):
+        optimizer.zero_grad()
+        loss.qvalue_v2_loss(data)[0].backward()
+        optimizer.step()
+    with torch.no_grad():
+        values = loss._outputs(data, loss._weights("qvalue_network"))
+    torch.testing.assert_close(values, torch.full_like(values, fixed_point), rtol=0.02, atol=0.01)
+
+
+def test_squared_error_is_the_square_itself_summed_over_critics() -> None:
+    """Stable-Baselines3 takes half of it."""
+    loss = make_loss()
+    SoftUpdate(loss, tau=0.1)
+    data = TestLeanSACLoss().data((4,))
+    data["next", "done"] = data["next", "terminated"] = torch.ones(4, 1, dtype=torch.bool)
+    values = loss._outputs(data, loss._weights("qvalue_network")).squeeze(-1)
+    error = values - data["next", "reward"].squeeze(-1)
+    torch.testing.assert_close(loss(data)["loss_qvalue"], error.square().mean(1).sum())
+
+
+def test_unknown_loss_function_is_refused() -> None:
+    with pytest.raises(ValueError, match="loss_function is 'huber'; choose one of l2, l1"):
+        make_loss(loss_function="huber")

@@ -26,10 +26,16 @@ class Posterior(NamedTuple):
 class _AtLeast(torch.autograd.Function):
     """A lower bound whose gradient still passes where it pulls the input up, out of the bound."""
 
+    generate_vmap_rule = True  # both ways are made of operations that torch.vmap knows
+
     @staticmethod
-    def forward(ctx: Any, value: Tensor, bound: float) -> Tensor:
-        ctx.save_for_backward(value >= bound)
+    def forward(value: Tensor, bound: float) -> Tensor:
         return value.clamp_min(bound)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
+        value, bound = inputs
+        ctx.save_for_backward(value >= bound)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
+from torch.distributions import Distribution
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import distance_loss
@@ -45,8 +47,11 @@ class LeanSACLoss(SACLoss):
     Keyword Args:
         support (Tensor, optional): evenly spaced returns [K], ascending; the critics then have K
             outputs. Default: ``None``, one output that is the value itself.
-        **kwargs: see :class:`torchrl.objectives.SACLoss`; ``loss_function`` is not read where
-            critics are categorical, whose loss is the cross entropy.
+        loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of scalar critics' errors;
+            categorical critics always minimize the cross entropy. ``"l2"`` is the square itself,
+            summed over critics; Stable-Baselines3 takes half of it. Default: ``"l2"``, where
+            TorchRL has ``"smooth_l1"``: only the square makes the critic the *mean* return.
+        **kwargs: see :class:`torchrl.objectives.SACLoss`.
 
     Keys:
         those of SACLoss.
@@ -54,7 +59,8 @@ class LeanSACLoss(SACLoss):
     Raises:
         TypeError: if the critic is not a TensorDictModule, or a ``value_network`` or
             ``skip_done_states`` is given.
-        ValueError: for an unknown reduction, or a support that is not evenly spaced and ascending.
+        ValueError: for an unknown reduction or ``loss_function``, or a support that is not evenly
+            spaced and ascending.
 
     Examples:
         >>> import torch
@@ -87,17 +93,19 @@ class LeanSACLoss(SACLoss):
         qvalue_network: TensorDictModule,
         *,
         support: Tensor | None = None,
+        loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
         **kwargs: Any,
     ) -> None:
         check_parts("qvalue_network", qvalue_network, TensorDictModule)
         check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
+        check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
         for name in ("value_network", "skip_done_states"):
             if kwargs.get(name):
                 raise TypeError(
                     f"{name} is given but {type(self).__name__} bootstraps on its critics, at "
                     "every next state; leave it out."
                 )
-        super().__init__(actor_network, qvalue_network, **kwargs)
+        super().__init__(actor_network, qvalue_network, loss_function=loss_function, **kwargs)
         if support is not None:
             _check_support(support)
             support = support.detach().clone()
@@ -114,7 +122,7 @@ class LeanSACLoss(SACLoss):
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            return compute_rsample_log_prob(self.actor_network.get_dist(observed))
+            return drawn(self.actor_network.get_dist(observed))
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """What the critics read where the actor's ``action`` is taken."""
@@ -139,8 +147,9 @@ class LeanSACLoss(SACLoss):
 
     def _weights(self, network: str, *, detached: bool = False) -> dict[str, Tensor]:
         """Parameters and buffers of a network by their dotted names."""
-        params = getattr(self, f"{network}_params")
-        weights = {**dict(params.named_parameters()), **dict(params.named_buffers())}
+        # Not named_parameters: it keeps naming the loss's own where others stand in for them.
+        leaves = getattr(self, f"{network}_params").items(True, True)
+        weights = {k if isinstance(k, str) else ".".join(k): x for k, x in leaves}
         return {k: x.detach() for k, x in weights.items()} if detached else weights
 
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
@@ -210,6 +219,23 @@ def _check_support(support: Tensor) -> None:
             f"support has shape {list(support.shape)} and must be evenly spaced and ascending, of "
             "two entries or more; make it with torch.linspace(low, high, bins)."
         )
+
+
+def drawn(distribution: Distribution) -> tuple[Tensor, Tensor]:
+    """A reparametrized sample [*, n] and its log-probability [*], under ``torch.vmap`` too.
+
+    ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses;
+    :func:`torch.randn_like` draws the same numbers.
+    """
+    if not isinstance(distribution, TanhNormal):
+        return compute_rsample_log_prob(distribution)
+    loc, scale = distribution.loc, distribution.scale
+    preimage = loc + scale * torch.randn_like(loc)
+    transform = distribution.transforms[0]
+    action = transform(preimage)
+    slope = transform.log_abs_det_jacobian(preimage, action)
+    log_prob = distribution.base_dist.log_prob(preimage)
+    return action, log_prob - slope.reshape(*log_prob.shape, -1).sum(-1)
 
 
 def call(network: TensorDictModule, weights: dict[str, Tensor], *inputs: Tensor) -> Tensor:
