@@ -8,7 +8,7 @@ from torchrl_etl.training.explore import ExploreStage
 from torchrl_etl.training.learn import LearnStage
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.synergy_report import fit_gmvae
-from torchrl_etl.training.video import record_episodes
+from torchrl_etl.training.video import check_video_size, record_episodes
 
 __all__ = [
     "Bench",
@@ -18,6 +18,7 @@ __all__ = [
     "Interrupted",
     "LearnStage",
     "Run",
+    "check_video_size",
     "evaluate",
     "fit_gmvae",
     "record_episodes",

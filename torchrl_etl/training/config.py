@@ -77,6 +77,11 @@ _RULES: tuple[_Rule, ...] = (
             *_both("actor.layer_norm", "critic.layer_norm"),
         ),
     ),
+    (
+        "arguments by name, such as env_kwargs={NAME: VALUE}",
+        lambda v: isinstance(v, DictConfig),
+        ("env_kwargs",),
+    ),
     ("true, false or null", lambda v: v is None or isinstance(v, bool), ("compile",)),
     (
         "a whole number above 0",
@@ -263,6 +268,7 @@ _FIXED = ("env", "goal", "action_repeat", "seed", "num_synergies", "synergies", 
 _FIXED += ("learn.sac.num_critics", "learn.residual", "learner", "experiment", "faithful")
 _FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
 _FIXED_SECTIONS = (
+    "env_kwargs",
     "method",
     "actor",
     "critic",

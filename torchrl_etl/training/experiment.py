@@ -46,6 +46,8 @@ class Experiment:
 
     Keyword Args:
         resume (path, optional): the run folder to go on in.
+        unique (bool): let the run folder get a number if another run was quicker to take its name.
+            Default: ``False``.
         say (callable): where messages for a person go, one line each. Default: nowhere.
 
     Raises:
@@ -57,14 +59,19 @@ class Experiment:
         config: DictConfig,
         *,
         resume: Path | None = None,
+        unique: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         validate(config)
         self.config, self.say = config.copy(), say
         self.device = torch.device(config.device)
-        self.path = resume or Path(config.run_dir)
+        self.path = Path(resume or config.run_dir).expanduser()
         self.task = resolve_task(config.env, config.goal)
-        self._variant = {"goal": config.goal, "action_repeat": config.action_repeat}
+        self._variant = {
+            "goal": config.goal,
+            "action_repeat": config.action_repeat,
+            "env_kwargs": OmegaConf.to_container(config.env_kwargs, resolve=True),
+        }
         self.make_env = partial(make_env, config.env, **self._variant, device=self.device)
         self.spec = self.make_env()
         self.actuators = actuator_names(self.spec)
@@ -82,11 +89,13 @@ class Experiment:
             )
         self._build_once()
         self.resume = resume is not None
-        self.folder = RunFolder(self.path, self.config)
+        self.folder = RunFolder(self.path, self.config, unique=unique)
 
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
         self.folder.open(resume=self.resume)
+        self.path = self.folder.path
+        self.say(f"Run folder: {self.path}")
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
         summary: dict[str, Any] = {
@@ -230,7 +239,8 @@ class Experiment:
 
     def evaluator(self, stage: SACStage) -> Callable[[], Evaluation]:
         """Evaluates the stage's present policy on the evaluation seeds."""
-        steps = episode_length(self.config.env, self.config.goal) or 1000
+        steps = self.config.env_kwargs.get("max_episode_steps")
+        steps = steps or episode_length(self.config.env, self.config.goal) or 1000
         return partial(
             evaluate,
             stage.trained_policy,

@@ -29,6 +29,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_etl.collectors import Batches, make_batches
 from torchrl_etl.collectors.seeds import training_seed
+from torchrl_etl.modules.atomic_files import reserve
 from torchrl_etl.objectives import FusedSoftUpdate
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.compiled import compiled, cuda_graph
@@ -286,7 +287,16 @@ def make_storage(size: int, device: torch.device, scratch: Path | None) -> Stora
     if scratch is None:
         return LazyTensorStorage(size, device=device)
     # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
-    return LazyMemmapStorage(size, scratch_dir=scratch, existsok=True)
+    return _ReservedMemmapStorage(size, scratch_dir=scratch, existsok=True)
+
+
+class _ReservedMemmapStorage(LazyMemmapStorage):
+    """TorchRL's storage maps sparse files: a full disk would kill the run later, without a word."""
+
+    def _init(self, data: Any) -> None:
+        super()._init(data)
+        for file in Path(self.scratch_dir).rglob("*.memmap"):
+            reserve(file)
 
 
 def ready_for_training(sac: SACLoss, *, gamma: float, tau: float) -> SoftUpdate:
