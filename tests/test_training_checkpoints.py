@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import resource
+import errno
+import os
 
 import pytest
 import torch
@@ -66,24 +67,25 @@ def test_an_empty_buffer_can_be_saved(tmp_path):
 
 
 @pytest.fixture
-def small_disk():
-    """Files of this process may have 100 kB: a full disk to whoever reserves space."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+def full_disk(monkeypatch):
+    """A disk that takes sparse files of any size, and no byte more."""
+
+    def no_space(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", no_space)
 
 
 def test_a_buffer_in_files_that_do_not_fit_on_the_disk_says_so_at_its_first_row(
-    tmp_path, small_disk
+    tmp_path, full_disk
 ):
     storage = make_storage(100_000, torch.device("cpu"), tmp_path / "buffer")
-    with pytest.raises(OSError, match="no room for 0.4 MB"):
+    with pytest.raises(OSError, match=r"no room for 0\.4 MB"):
         TensorDictReplayBuffer(storage=storage, batch_size=4).extend(rows(0, 3))
 
 
 def test_a_checkpoint_that_does_not_fit_on_the_disk_says_so_and_leaves_the_last_one(
-    tmp_path, small_disk
+    tmp_path, full_disk
 ):
     checkpoints = Checkpoints(tmp_path, keep_last=2)
     with pytest.raises(OSError, match="There is no room for"):

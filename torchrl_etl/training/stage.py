@@ -294,7 +294,10 @@ class _ReservedMemmapStorage(LazyMemmapStorage):
     """TorchRL's storage maps sparse files: a full disk would kill the run later, without a word."""
 
     def _init(self, data: Any) -> None:
-        super()._init(data)
+        try:
+            super()._init(data)
+        except RuntimeError as error:  # how PyTorch says that a file cannot be so large
+            raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
         for file in Path(self.scratch_dir).rglob("*.memmap"):
             reserve(file)
 
