@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from rich.live import Live
 from rich.table import Table
 
 from torchrl_etl.checks import check_choice
+from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.training import Bench, Run, validate
 
@@ -38,6 +40,9 @@ def main(config: DictConfig) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         bench = Bench(runs, Path(config.out), jobs=config.jobs or cores, attempts=config.attempts)
     display = Display(bench)
+    for number in STOP_SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.default_int_handler)
     try:
         with Live(display.table(), refresh_per_second=1) as live:
             for _ in bench:

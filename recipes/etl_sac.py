@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +42,23 @@ SYNERGIES = (
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with one_sentence(ValueError, OSError, ImportError, gymnasium.error.Error):
+        given = list(HydraConfig.get().overrides.task)
         resume = None
         if config.resume is not None:
             resume = Path(config.resume)
-            config = resumed_config(resume, list(HydraConfig.get().overrides.task))
-        experiment = Experiment(config, resume=resume, say=print)
-    folder = experiment.folder.path
-    print(f"Run folder: {folder}")
+            config = resumed_config(resume, given)
+        # Two runs that begin in the same second have the same name by default.
+        named = any(override.lstrip("+").startswith("run_dir=") for override in given)
+        experiment = Experiment(config, resume=resume, unique=not named, say=print)
     try:
         with one_sentence(OSError, SimulationError, CollectionError):
             summary = experiment.run()
     except Interrupted:
-        command = shlex.join(["python", sys.argv[0], f"resume={folder}"])
-        print(f"Stopped and saved. To go on: {command}")
+        command = shlex.join(["python", sys.argv[0], f"resume={experiment.folder.path}"])
+        with suppress(OSError):  # the terminal may be gone
+            print(f"Stopped and saved. To go on: {command}", flush=True)
         sys.exit(130)
-    print(report(summary, folder))
+    print(report(summary, experiment.folder.path))
 
 
 def report(summary: dict[str, Any], folder: Path) -> str:

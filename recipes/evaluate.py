@@ -13,17 +13,18 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
+from torchrl_etl.gl_backend import draw_without_display
+
+if "video=true" in sys.argv[1:]:
+    draw_without_display()
 from torchrl_etl.command_line import (
     check_overrides,
-    draw_without_display,
     one_sentence,
     quiet_torchrl,
     quote_paths,
 )
-
-draw_without_display()
-from torchrl_etl.experiment import Experiment  # noqa: E402
-from torchrl_etl.training import record_episodes, resumed_config  # noqa: E402
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import check_video_size, record_episodes, resumed_config
 
 CONF = Path(__file__).parent / "conf"
 
@@ -34,6 +35,7 @@ def main(config: DictConfig) -> None:
     with one_sentence(ValueError, OSError):
         if config.run is None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
+        size = check_video_size(config.video_size)
         run = Path(config.run)
         trained = resumed_config(
             run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]
@@ -55,11 +57,11 @@ def main(config: DictConfig) -> None:
     if config.video:
         with one_sentence(RuntimeError, ValueError):
             videos = record_episodes(
-                experiment.evaluation_env(stage),
-                stage.trained_policy,
+                experiment.context.make_env(),
+                stage.learner.policy,
                 experiment.folder.path / "videos",
                 episodes=config.video_episodes,
-                size=tuple(config.video_size),
+                size=size,
                 camera=config.video_camera,
             )
         print("  videos  " + ", ".join(str(video) for video in videos))

@@ -237,3 +237,13 @@ def test_synergies_of_hand_pose_fit_the_other_hand_tasks_and_no_leg(tmp_path):
     names, space = spaces["myoLegWalk"]
     with pytest.raises(BundleError, match=r"with no name in common: it is for another body"):
         check_compatible(described, names, space.low, space.high)
+
+
+@pytest.mark.parametrize("fault", [float("nan"), float("inf")])
+def test_a_decoder_that_is_not_finite_is_not_saved(fault, tmp_path):
+    decoder = SynergyDecoder(2, 3)
+    with torch.no_grad():
+        next(decoder.parameters()).view(-1)[0] = fault
+    with pytest.raises(BundleError, match="not finite"):
+        save_bundle(decoder, tmp_path / "own", task="toy", actuators=["a", "b", "c"])
+    assert not list(tmp_path.iterdir())

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from tests.configs import ROOT, TINY
+from torchrl_etl.command_line import quote_paths
 from torchrl_etl.modules.bundle import load_bundle, save_bundle
 
 SMALL = [override for override in TINY if not override.startswith("env=")]
@@ -154,6 +155,17 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("etl_sac.py", "enf=myoHandPose", "did you mean env"),
         ("etl_sac.py", "learn.frame=3", "learn.frames"),
         ("etl_sac.py", "env=myoHandPos", "myoHandPose"),
+        ("etl_sac.py", "+learn.sac.gama=0.9", "did you mean learn.sac.gamma"),
+        ("etl_sac.py", "++runs_dir=a", "did you mean run_dir"),
+        ("etl_sac.py", "+new=1", "there is no setting 'new'"),
+        ("etl_sac.py", "~learn.sac.gama", "did you mean learn.sac.gamma"),
+        ("etl_sac.py", "-m", "recipes/bench.py"),
+        ("bench.py", "--multirun", "recipes/bench.py"),
+        ("etl_sac.py", "+env_kwargs.gravity=0", "does not take env_kwargs={'gravity': 0}"),
+        ("evaluate.py", "video_size=[480,641]", "two even whole numbers"),
+        ("evaluate.py", "video_size=480", "two even whole numbers"),
+        ("evaluate.py", "video_size=[0,0]", "two even whole numbers"),
+        ("evaluate.py", "video_size=[a,b]", "two even whole numbers"),
         ("etl_sac.py", "myoHandPose", "not of the form key=value"),
         ("evaluate.py", "run=no (where)", "holds no run"),
         ("evaluate.py", "episodes=3", "no run is named; pass run=PATH"),
@@ -166,6 +178,35 @@ def test_a_typo_gets_the_nearest_right_word_and_no_traceback(recipe, override, w
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
+    code = (
+        "import os, sys\n"
+        "from torchrl_etl.gl_backend import draw_without_display\n"
+        "assert 'mujoco' not in sys.modules\n"
+        "draw_without_display()\n"
+        "assert 'mujoco' not in sys.modules\n"
+        "print(os.environ.get('MUJOCO_GL', 'none works'))\n"
+        "import mujoco\n"
+        "if 'MUJOCO_GL' in os.environ: mujoco.GLContext(16, 16).make_current()\n"
+    )
+    environ = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environ |= {"MUJOCO_GL": ""}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environ)
+    assert done.returncode == 0, done.stderr
+    recipe = (ROOT / "recipes" / "evaluate.py").read_text()
+    assert recipe.index("draw_without_display()") < recipe.index("torchrl_etl.training")
+
+
+def test_a_tilde_is_the_home_folder(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    given = ["run_dir=~/runs", "resume='~/a b'", "seed=~/x"]
+    assert quote_paths(given, "run_dir", "resume") == [
+        "run_dir='/home/me/runs'",
+        "resume='/home/me/a b'",
+        "seed=~/x",
+    ]
 
 
 def test_help_explains_the_settings(tmp_path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,6 +12,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_etl.training.buffer_adapter import BufferAdapter
+from torchrl_etl.training.checkpoints import Checkpoints, _size
+from torchrl_etl.training.stage import make_storage
 
 
 def buffer(capacity: int) -> TensorDictReplayBuffer:
@@ -59,3 +64,42 @@ def test_only_the_filled_part_is_written(tmp_path):
 
 def test_an_empty_buffer_can_be_saved(tmp_path):
     assert len(copied(buffer(4), 4, tmp_path / "saved")) == 0
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """A disk that takes sparse files of any size, and no byte more."""
+
+    def no_space(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", no_space)
+
+
+def test_a_buffer_in_files_that_do_not_fit_on_the_disk_says_so_at_its_first_row(
+    tmp_path, full_disk
+):
+    storage = make_storage(100_000, torch.device("cpu"), tmp_path / "buffer")
+    with pytest.raises(OSError, match="There is no room for"):
+        TensorDictReplayBuffer(storage=storage, batch_size=4).extend(rows(0, 3))
+
+
+def test_a_checkpoint_that_does_not_fit_on_the_disk_says_so_and_leaves_the_last_one(
+    tmp_path, full_disk
+):
+    checkpoints = Checkpoints(tmp_path, keep_last=2)
+    with pytest.raises(OSError, match="There is no room for"):
+        checkpoints.save(Checkpoint(module=torch.nn.Linear(9, 9)), step=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_size_of_a_checkpoint_counts_every_tensor():
+    module = torch.nn.Linear(3, 2)  # 8 floats
+    optimizer = torch.optim.Adam(module.parameters())
+    module(torch.ones(3)).sum().backward()
+    optimizer.step()  # two moments of each, and a count of steps for two tensors
+    assert _size({"module": module}) == 4 * 8
+    assert _size([optimizer]) == 4 * (2 * 8 + 2)
+    filled = buffer(10)
+    filled.extend(rows(0, 3))
+    assert _size(filled) >= 4 * 3 * 2

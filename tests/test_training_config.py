@@ -6,13 +6,16 @@ import itertools
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from tests.configs import CONF, tiny
 from torchrl_etl.envs import list_tasks
+from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.training import resumed_config, validate
+from torchrl_etl.training import resumed_config, run_folder, validate
+from torchrl_etl.training.run_folder import RunFolder
 
 GROUPS = {
     name: sorted(p.stem for p in (CONF / name).glob("*.yaml"))
@@ -159,3 +162,39 @@ def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
     experiment = Experiment(tiny("synergies=bundle", "num_synergies=2"))
     assert experiment.config.num_synergies == 3
     assert experiment.config.synergies == str(tmp_path / "bundle")
+
+
+def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
+    folders = [RunFolder(tmp_path / "run", tiny(), unique=True) for _ in range(3)]
+    for folder in folders:
+        folder.open(resume=False)
+    assert [folder.path.name for folder in folders] == ["run", "run-2", "run-3"]
+    for folder in folders:
+        assert OmegaConf.load(folder.path / "config.yaml").run_dir == str(folder.path)
+        folder.close()
+
+
+def test_wandb_gets_name_and_configuration_and_a_resumed_run_is_the_same_run(tmp_path, monkeypatch):
+    begun = []
+
+    def get_logger(kind, folder, title, *, wandb_kwargs):
+        begun.append((kind, title, wandb_kwargs))
+        return None
+
+    monkeypatch.setattr(run_folder, "get_logger", get_logger)
+    config = tiny("+logger_kwargs.wandb.project=mine", "learn.frames=777")
+    (tmp_path / "a").mkdir()
+    for _ in range(2):
+        RunFolder(tmp_path / "a", config)._logger("wandb")
+    (tmp_path / "b").mkdir()
+    RunFolder(tmp_path / "b", config)._logger("wandb")
+    titles, kwargs = [title for _, title, _ in begun], [kwargs for _, _, kwargs in begun]
+    assert titles == ["a", "a", "b"]
+    assert kwargs[0]["project"] == "mine" and kwargs[0]["config"]["learn"]["frames"] == 777
+    assert kwargs[0]["id"] == kwargs[1]["id"] != kwargs[2]["id"]
+
+
+def test_arguments_reach_the_simulator(tmp_path):
+    config = tiny("env=Pendulum-v1", "+env_kwargs.g=0.0", f"run_dir='{tmp_path}/run'")
+    experiment = Experiment(OmegaConf.merge(config, {"num_synergies": 1}))
+    assert simulator(experiment.spec).g == 0.0

@@ -19,6 +19,7 @@ from torchrl_etl.training.learn import LearnStage
 
 from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
@@ -167,7 +168,7 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
     assert numbers(broken) == numbers(whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatch):
     run = tmp_path / "run"
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
@@ -189,6 +190,30 @@ def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatc
     assert summary["learn"]["frames"] == 608
     frames, _ = experiment.folder.series("explore/updates")
     assert frames == sorted(set(frames)), "no frame is logged twice"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["process", "async"])
+def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, tmp_path):
+    run = tmp_path / "run"
+    arguments = [*TINY, f"collector={kind}", "collector.num_workers=2", "explore.frames=1000000"]
+    process = subprocess.Popen(
+        [sys.executable, ROOT / "recipes" / "etl_sac.py", *arguments, f"run_dir='{run}'"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    rows = run / "csv/scalars/explore/updates.csv"
+    deadline = time.monotonic() + 200
+    while not rows.exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGTERM)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, output
+    assert list(run.glob("checkpoints/explore/*/seal.json"))
+    assert "Traceback" not in output
 
 
 def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_path):

@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes.util import find_library
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -17,17 +16,22 @@ from torchrl_etl.checks import check_choice
 
 __all__ = [
     "check_overrides",
-    "draw_without_display",
     "one_sentence",
     "quiet_torchrl",
     "quote_paths",
 ]
 
 
+# Sections whose keys are arguments of someone else's function.
+_OPEN = ("env_kwargs.", "logger_kwargs.", "ray.", "distributed.")
+
+
 def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
     """Answer ``--help``, and leave with the nearest key if an override names none that exists.
 
-    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing.
+    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing. A
+    plus in front of a key is no way around: nothing would read what it adds, but in the sections
+    that are handed on to another library.
 
     Args:
         config (path): the primary YAML file; folders beside it are groups.
@@ -51,11 +55,17 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
             known += _keys(OmegaConf.load(choice), prefix)
     for argument in arguments:
         key, separator, value = argument.partition("=")
-        if argument.startswith(("-", "+", "~")) or key.startswith("hydra"):
+        key = key.lstrip("+~")
+        if argument in ("-m", "--multirun"):
+            sys.exit(
+                f"Error: {argument} is not supported; recipes/bench.py runs several, such as "
+                "methods=[sac,etl] seeds=[0,1], side by side, and goes on if it is interrupted."
+            )
+        if argument.startswith("-") or key.partition(".")[0] == "hydra" or key.startswith("hydra/"):
             continue
-        if not separator:
+        if not separator and not argument.startswith("~"):
             sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
-        if key not in known:
+        if key not in known and not key.startswith(_OPEN):
             near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
@@ -67,6 +77,8 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
 def quote_paths(arguments: list[str], *keys: str) -> list[str]:
     """Quote the values of path settings, in which Hydra's grammar allows no bracket or space.
 
+    A ``~`` is the home folder, as in the arguments that the shell expands.
+
     Examples:
         >>> quote_paths(["run_dir=/my (new) runs/a", "seed=1"], "run_dir")
         ["run_dir='/my (new) runs/a'", 'seed=1']
@@ -74,9 +86,13 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
     quoted = []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key in keys and value not in ("", "null") and value[0] not in "'\"":
-            value = value.replace("'", "\\'")
-            argument = f"{key}='{value}'"
+        if key.lstrip("+") in keys and value not in ("", "null"):
+            if value[0] in "'\"":
+                value = value[0] + os.path.expanduser(value[1:])
+            else:
+                value = os.path.expanduser(value).replace("'", "\\'")
+                value = f"'{value}'"
+            argument = f"{key}={value}"
         quoted.append(argument)
     return quoted
 
@@ -89,15 +105,6 @@ def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(2)
-
-
-def draw_without_display() -> None:
-    """Let MuJoCo draw through EGL where there is no display.
-
-    MuJoCo chooses its back end when it is first imported, so call this before.
-    """
-    if "DISPLAY" not in os.environ and find_library("EGL"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 def quiet_torchrl() -> None:

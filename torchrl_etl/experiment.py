@@ -35,6 +35,8 @@ class Experiment:
 
     Keyword Args:
         resume (path, optional): the run folder to go on in.
+        unique (bool): let the run folder get a number if another run was quicker to take its name.
+            Default: ``False``.
         say (callable): where messages for a person go, one line each. Default: nowhere.
 
     Raises:
@@ -46,13 +48,15 @@ class Experiment:
         config: DictConfig,
         *,
         resume: Path | None = None,
+        unique: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         validate(config)
         check_choice("method.learner", config.method.learner, list(METHODS))
         self.config = config.copy()
         self.task = resolve_task(config.env, config.goal)
-        self.folder = RunFolder(resume or Path(config.run_dir), self.config)
+        path = Path(resume or config.run_dir).expanduser()
+        self.folder = RunFolder(path, self.config, unique=unique)
         self.context = Context(self.config, self.folder, say)
         self.method = METHODS[config.method.learner](self.context)
         if config.frames is not None:
@@ -65,6 +69,7 @@ class Experiment:
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
         self.folder.open(resume=self.resume)
+        self.context.say(f"Run folder: {self.folder.path}")
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
         summary: dict[str, Any] = {
@@ -97,12 +102,13 @@ class Experiment:
 
     def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
         """Evaluates the stage's present policy on the evaluation seeds."""
+        steps = self.config.env_kwargs.get("max_episode_steps")
         return partial(
             evaluate,
             stage.learner.policy,
             self.context.make_env(),
             episodes=self.config.evaluation.episodes,
-            max_steps=episode_length(self.config.env, self.config.goal) or 1000,
+            max_steps=steps or episode_length(self.config.env, self.config.goal) or 1000,
             action_repeat=self.config.action_repeat,
         )
 

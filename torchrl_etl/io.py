@@ -6,8 +6,16 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
-__all__ = ["flush_folder", "replace_folder", "surviving_folder", "write_atomically"]
+__all__ = [
+    "flush_folder",
+    "replace_folder",
+    "require_room",
+    "reserve",
+    "surviving_folder",
+    "write_atomically",
+]
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -93,3 +101,40 @@ def flush_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def reserve(path: Path) -> None:
+    """Take the disk space that a sparse file has only promised.
+
+    Whoever writes through a memory map of a file that finds no space any more is killed by a bus
+    error; here it is an ``OSError`` that says so.
+    """
+    with path.open("r+b") as file:
+        _allocate(file, path.stat().st_size, path.parent)
+
+
+def require_room(folder: Path, size: int) -> None:
+    """Raise an ``OSError`` unless ``size`` more bytes can be written to ``folder``.
+
+    Asked by taking them for a moment, since quotas and limits do not show in what a disk says is
+    free.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    probe = folder / f".room-{os.getpid()}"
+    try:
+        with probe.open("wb") as file:
+            _allocate(file, size, folder)
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def _allocate(file: IO[bytes], size: int, folder: Path) -> None:
+    if size == 0 or not hasattr(os, "posix_fallocate"):  # macOS
+        return
+    try:
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        raise OSError(
+            f"There is no room for {size / 1e6:,.1f} MB in {folder} ({error.strerror}); free "
+            "some space there, or let the run have a folder on another disk."
+        ) from error

@@ -4,9 +4,11 @@ from torchrl_etl.collectors.batches import Batches, CollectionError
 from torchrl_etl.collectors.factory import COLLECTORS, make_batches
 from torchrl_etl.collectors.process import AsyncProcessWorkers, ProcessWorkers
 from torchrl_etl.collectors.vector import VectorCollector
+from torchrl_etl.collectors.worker_process import STOP_SIGNALS
 
 __all__ = [
     "COLLECTORS",
+    "STOP_SIGNALS",
     "AsyncProcessWorkers",
     "Batches",
     "CollectionError",

@@ -26,6 +26,7 @@ from torchrl_etl.collectors.remote import (
     seeded_env,
     worker_seed,
 )
+from torchrl_etl.collectors.worker_process import live_as_long_as_the_learner
 
 __all__ = ["DistributedWorkers"]
 
@@ -254,6 +255,7 @@ _main = generic._distributed_init_collection_node
 
 def _seeded_main(seed: int, **kwargs: Any) -> None:
     """A worker's main function: TorchRL's, with an environment that is built and seeded here."""
+    live_as_long_as_the_learner()
     kwargs["env_make"] = seeded_env(kwargs["env_make"], worker_seed(seed, kwargs["rank"] - 1))
     _main(**kwargs)
 

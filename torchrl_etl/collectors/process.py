@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -15,6 +14,10 @@ from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 
 from torchrl_etl.collectors.vector import VectorCollector
+from torchrl_etl.collectors.worker_process import (
+    live_as_long_as_the_learner,
+    stop_signals_blocked,
+)
 
 __all__ = ["AsyncProcessWorkers", "ProcessWorkers"]
 
@@ -36,13 +39,14 @@ class _OwnWeights:
     ) -> None:
         self._learner = policy
         kwargs = {"collector_class": VectorCollector, "use_buffers": True, **kwargs}
-        super().__init__(
-            [create_env_fn] * num_workers,
-            deepcopy(policy).cpu(),
-            init_fn=_leave_ctrl_c_to_the_learner,
-            num_threads=torch.get_num_threads(),  # TorchRL would take one from us for each worker
-            **kwargs,
-        )
+        with stop_signals_blocked():  # workers are born with that, and import for seconds
+            super().__init__(
+                [create_env_fn] * num_workers,
+                deepcopy(policy).cpu(),
+                init_fn=live_as_long_as_the_learner,
+                num_threads=torch.get_num_threads(),  # TorchRL would take one from us for each
+                **kwargs,
+            )
 
     def update_policy_weights_(
         self,
@@ -102,8 +106,3 @@ class AsyncProcessWorkers(_OwnWeights, MultiAsyncCollector):
 
     Args and Keyword Args as for :class:`ProcessWorkers`, but ``frames_per_batch`` is of one worker.
     """
-
-
-def _leave_ctrl_c_to_the_learner() -> None:
-    # A terminal sends it to every process; the learner stops the workers when it has saved.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

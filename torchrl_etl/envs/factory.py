@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -87,8 +88,8 @@ def make_env(
           for.
 
     Raises:
-        ValueError: for an unknown name, a goal that the task lacks, or actions that are not
-            continuous. While it runs, the environment raises
+        ValueError: for an unknown name, a goal that the task lacks, ``env_kwargs`` that it does not
+            take, or actions that are not continuous. While it runs, the environment raises
             :class:`~torchrl_etl.envs.SimulationError` if a value is not finite.
 
     Examples:
@@ -112,7 +113,7 @@ def make_env(
         action_repeat=action_repeat,
         env_kwargs=dict(env_kwargs or {}),
     )
-    with quiet_compiler():
+    with quiet_compiler(), _argument_errors(task, env_kwargs):
         if num_envs == 1:
             env = GymWrapper(build(), device=device)
         else:
@@ -154,6 +155,20 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
     if all(name.endswith("_r") for name in names):
         return [name.removesuffix("_r") for name in names]
     return names
+
+
+@contextmanager
+def _argument_errors(task: Task, env_kwargs: Mapping[str, Any] | None) -> Iterator[None]:
+    """Name the task and the arguments where a simulator says "unexpected keyword" alone."""
+    try:
+        yield
+    except TypeError as error:
+        if not env_kwargs:
+            raise
+        raise ValueError(
+            f"{task.name} does not take env_kwargs={dict(env_kwargs)} ({error}); use names and "
+            "types that its own constructor knows."
+        ) from error
 
 
 class _BatchedGymWrapper(GymWrapper):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from torchrl.data import Bounded
@@ -45,7 +46,6 @@ class DynSyn(Method):
         self.amplitude = self.of_the_body(options.pop("amplitude"))
         self.share = self.of_the_body(options.pop("group_share"))
         self.actor_options = options
-        self.file = context.folder.path / "muscle_groups.json"
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
         if not self.file.is_file():
@@ -59,6 +59,10 @@ class DynSyn(Method):
             groups = group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed)
             write_atomically(self.file, json.dumps(groups.tolist()))
         return {"groups": self.groups}
+
+    @property
+    def file(self) -> Path:
+        return self.context.folder.path / "muscle_groups.json"
 
     @property
     def groups(self) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -45,7 +46,6 @@ class SAR(Method):
         self.charged = self.options["frames"] + self.rollout_frames
         self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
         self.blend = self.of_the_body(self.options["blend"])
-        self.file = context.folder.path / "sar.safetensors"
         self.play_spec = context.spec
         if self.task is not None:
             env = make_env(self.task, action_repeat=config.action_repeat)
@@ -63,6 +63,10 @@ class SAR(Method):
                 f"simulators need {needed} for two whole episodes of {steps} steps, and SAR takes "
                 "the best of whole episodes; give more."
             )
+
+    @property
+    def file(self) -> Path:
+        return self.context.folder.path / "sar.safetensors"
 
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
         if not self.file.is_file():

@@ -117,6 +117,12 @@ def save_bundle(
             f"{len(actuators)} actuator names ({len(set(actuators))} different) came with a "
             f"decoder for {decoder.action_dim} actuators; pass one name for each, in order."
         )
+    for key, value in decoder.state_dict().items():
+        if not value.isfinite().all():
+            raise BundleError(
+                f"{key} of the decoder is not finite, so it has no synergies to save; its training "
+                "diverged: lower the learning rate or look for NaN in the actions it was fitted to."
+            )
     tensors = safetensors.torch.save(
         {key: value.detach().cpu().clone() for key, value in decoder.state_dict().items()}
     )

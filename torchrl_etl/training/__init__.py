@@ -6,7 +6,7 @@ from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.stage import Stage
-from torchrl_etl.training.video import record_episodes
+from torchrl_etl.training.video import check_video_size, record_episodes
 
 __all__ = [
     "Bench",
@@ -15,6 +15,7 @@ __all__ = [
     "Interrupted",
     "Run",
     "Stage",
+    "check_video_size",
     "evaluate",
     "record_episodes",
     "resumed_config",

@@ -7,16 +7,20 @@ import json
 import os
 import shutil
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.data import ReplayBuffer
 
-from torchrl_etl.io import write_atomically
+from torchrl_etl.io import require_room, write_atomically
 
 __all__ = ["Checkpoints"]
 
 _SEAL = "seal.json"
+_SMALL_FILES = 1_000_000  # bytes, generously, of the JSON beside the tensors
 # What TorchRL writes for tensors and plain values. Anything else (a pickle above all) could run
 # code when loaded, so it is refused before TorchRL sees it.
 _PLAIN_FILES = {".json", ".memmap"}
@@ -40,6 +44,8 @@ class Checkpoints(CheckpointRotation):
     def save(self, checkpoint: Checkpoint, *, step: int, **kwargs: Any) -> Path:
         """Save, flush and seal a checkpoint of frame ``step``; returns its folder."""
         self._remove_leftovers()
+        # TorchRL writes tensors through maps of sparse files, which a full disk makes deadly.
+        require_room(self.directory, _size(checkpoint.components) + _SMALL_FILES)
         try:
             folder = super().save(checkpoint, step=step, **kwargs)
         except RuntimeError as error:  # how PyTorch says that the disk is full
@@ -81,6 +87,19 @@ class Checkpoints(CheckpointRotation):
         for pattern in (".*.stage-*", ".*.delete-*", ".*.backup-*"):
             for leftover in self.directory.glob(pattern):
                 shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _size(value: Any) -> int:
+    """Bytes of all tensors below a component of a checkpoint."""
+    if isinstance(value, torch.Tensor):
+        return value.numel() * value.element_size()
+    if isinstance(value, ReplayBuffer):
+        return value.storage[:].bytes() if len(value) else 0
+    if isinstance(value, Mapping):
+        return sum(map(_size, value.values()))
+    if isinstance(value, (list, tuple)):
+        return sum(map(_size, value))
+    return _size(value.state_dict()) if hasattr(value, "state_dict") else 0
 
 
 def _digests(folder: Path, *, flush: bool = False) -> dict[str, str]:

@@ -81,6 +81,11 @@ def validate(config: DictConfig) -> None:
         pictures=config.pictures,
         **{"learn.prefill": config.learn.prefill, "collector.ahead": config.collector.ahead},
     )
+    if not isinstance(config.env_kwargs, DictConfig):
+        raise ValueError(
+            f"env_kwargs is {config.env_kwargs!r}; it must be arguments by name, such as "
+            "env_kwargs={NAME: VALUE}."
+        )
     if config.compile is not None:
         check_flag(compile=config.compile)
     for name in ("frames", "threads"):

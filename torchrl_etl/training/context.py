@@ -56,8 +56,16 @@ class Context:
 
     def make_env(self, **options: Any) -> EnvBase:
         """One simulator of the task."""
-        variant = {"goal": self.config.goal, "action_repeat": self.config.action_repeat}
-        return make_env(self.config.env, device=self.device, **{**variant, **options})
+        return make_env(self.config.env, device=self.device, **{**self.variant, **options})
+
+    @property
+    def variant(self) -> dict[str, Any]:
+        """Arguments of :func:`~torchrl_etl.envs.make_env` that make the task what it is."""
+        return {
+            "goal": self.config.goal,
+            "action_repeat": self.config.action_repeat,
+            "env_kwargs": self.options("env_kwargs"),
+        }
 
     def learner(
         self, section: str = "learn", *, spec: EnvironmentSpec | None = None, **parts: Any
@@ -115,11 +123,9 @@ class Context:
         make_env = partial(
             env_of_a_collector,
             task or self.config.env,
-            goal=None if task else self.config.goal,
-            action_repeat=self.config.action_repeat,
             num_envs=num_envs,
             transforms=tuple(env_transforms),
-            **env_options or {},
+            **{**self.variant, **({"goal": None} if task else {}), **(env_options or {})},
         )
         configured = self.options(section)
         for key in NOT_OF_THE_STAGE:

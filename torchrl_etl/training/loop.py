@@ -12,6 +12,7 @@ from types import FrameType, TracebackType
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.run_folder import RunFolder
@@ -25,9 +26,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopOnSignal(AbstractContextManager):
-    """Turns the first Ctrl-C or SIGTERM into a request to stop at the next safe point.
+    """Turns the first stop signal into a request to stop at the next safe point.
 
-    A second one ends the process at once.
+    Stop signals are Ctrl-C, SIGTERM, SIGUSR1 (what Slurm is told to send before the time is up)
+    and SIGHUP (a closed terminal; ``nohup`` still means to live on). A second one ends the process
+    at once.
     """
 
     def __init__(self) -> None:
@@ -35,7 +38,9 @@ class StopOnSignal(AbstractContextManager):
         self._previous: dict[int, object] = {}
 
     def __enter__(self) -> StopOnSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOP_SIGNALS:
+            if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue
             self._previous[number] = signal.signal(number, self._handle)
         return self
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
 import platform
 import subprocess
+import uuid
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -31,10 +33,14 @@ class RunFolder:
     Args:
         path (path): the folder; nothing is written before :meth:`open`.
         config (DictConfig): resolved configuration; its ``log`` names the loggers.
+
+    Keyword Args:
+        unique (bool): let :meth:`open` add a number to the name if another run was quicker to take
+            it. Default: ``False``.
     """
 
-    def __init__(self, path: Path, config: DictConfig) -> None:
-        self.path = Path(path).resolve()
+    def __init__(self, path: Path, config: DictConfig, *, unique: bool = False) -> None:
+        self.path, self._unique = Path(path).expanduser().resolve(), unique
         self._config, self._loggers, self._purge_step = config, None, None
 
     def open(self, *, resume: bool) -> None:
@@ -44,16 +50,23 @@ class RunFolder:
             FileExistsError: if the folder already holds a run and ``resume`` is False.
             OSError: if the folder cannot be written.
         """
-        if (self.path / "config.yaml").exists() and not resume:
-            raise FileExistsError(
-                f"{self.path} already holds a run; go on with it by resume={self.path}, or choose "
-                "another run_dir."
-            )
         try:
+            if self._unique and not resume:
+                self.path = _claimed(self.path)
+                self._config.run_dir = str(self.path)
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock = FileLock(self.path / ".lock", is_singleton=True)
             self._lock.acquire(timeout=0)
+            # Asked only now: of two runs that begin together, one may have been through already.
+            if (self.path / "config.yaml").exists() and not resume:
+                self._lock.release()
+                raise _HoldsARun(
+                    f"{self.path} already holds a run; go on with it by resume={self.path}, or "
+                    "choose another run_dir."
+                )
             write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
+        except _HoldsARun:
+            raise
         except Timeout:
             raise FileExistsError(
                 f"Another process is at work in {self.path}; wait for it, or stop it."
@@ -139,8 +152,38 @@ class RunFolder:
     def _logger(self, name: str) -> Logger:
         if name == "tensorboard":
             return _ResumableTensorboard(str(self.path), self._purge_step)
-        extra = self._config.get("logger_kwargs", {}).get(name, {})
-        return get_logger(name, str(self.path), name, **{f"{name}_kwargs": dict(extra)})
+        extra = {} if name == "csv" else self._own(name)
+        extra |= self._config.get("logger_kwargs", {}).get(name, {})
+        title = name if name == "csv" else self.path.name
+        return get_logger(name, str(self.path), title, **{f"{name}_kwargs": extra})
+
+    def _own(self, name: str) -> dict[str, Any]:
+        """What tells this run from others in a logger's own list of them."""
+        if name == "mlflow":  # has a store of its own in every run folder
+            return {}
+        config = OmegaConf.to_container(self._config, resolve=True)
+        if name == "trackio":  # knows a run again by its name
+            return {"config": config}
+        known = self.path / "wandb.json"
+        if not known.exists():
+            self.write_json(known.name, {"id": uuid.uuid4().hex})
+        return {"config": config, "id": json.loads(known.read_text())["id"]}
+
+
+def _claimed(path: Path) -> Path:
+    """A folder of this name, or with a number after it, that nobody else has."""
+    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    for candidate in itertools.chain([path], numbered):
+        try:
+            candidate.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return candidate
+    raise AssertionError("numbers do not end")
+
+
+class _HoldsARun(FileExistsError):
+    """Not one of the faults that make a folder unwritable."""
 
 
 class _ResumableTensorboard(TensorboardLogger):

@@ -22,6 +22,7 @@ from torchrl.envs.transforms import Transform
 from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, make_batches
 from torchrl_etl.collectors.seeds import training_seed
+from torchrl_etl.io import reserve
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
@@ -250,7 +251,19 @@ def make_storage(size: int, device: torch.device, scratch: Path | None) -> Stora
     if scratch is None:
         return LazyTensorStorage(size, device=device)
     # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
-    return LazyMemmapStorage(size, scratch_dir=scratch, existsok=True)
+    return ReservedMemmapStorage(size, scratch_dir=scratch, existsok=True)
+
+
+class ReservedMemmapStorage(LazyMemmapStorage):
+    """TorchRL's storage maps sparse files: a full disk would kill the run later, without a word."""
+
+    def _init(self, data: Any) -> None:
+        try:
+            super()._init(data)
+        except RuntimeError as error:  # how PyTorch says that a file cannot be so large
+            raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
+        for file in Path(self.scratch_dir).rglob("*.memmap"):
+            reserve(file)
 
 
 def frames_per_action(collector: Mapping[str, Any], action_repeat: int) -> int:

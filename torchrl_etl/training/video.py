@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -14,7 +15,37 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_etl.envs import mujoco_state
 from torchrl_etl.training.evaluation import EVALUATION_SEED
 
-__all__ = ["record_episodes"]
+__all__ = ["check_video_size", "record_episodes"]
+
+
+def check_video_size(size: Sequence[int]) -> tuple[int, int]:
+    """Height and width, if a video can have them.
+
+    Raises:
+        ValueError: if they are not two even numbers from 16 to 4096: the usual coding of colours
+            in MP4 takes two by two pixels together.
+
+    Examples:
+        >>> check_video_size([480, 640])
+        (480, 640)
+        >>> check_video_size([480, 641])
+        Traceback (most recent call last):
+        ...
+        ValueError: video_size is [480, 641]; it must be ...
+    """
+    listed = isinstance(size, Sequence) and not isinstance(size, str)
+    numbers = list(size) if listed else size
+    if not (
+        listed
+        and len(numbers) == 2
+        and all(isinstance(number, int) and number % 2 == 0 for number in numbers)
+        and all(16 <= number <= 4096 for number in numbers)
+    ):
+        raise ValueError(
+            f"video_size is {numbers!r}; it must be height and width, two even whole numbers from "
+            "16 to 4096, such as [480,640]."
+        )
+    return numbers[0], numbers[1]
 
 
 def record_episodes(
