@@ -43,7 +43,10 @@ def main(config: DictConfig) -> None:
         resume = None
         if config.resume is not None:
             resume = Path(config.resume)
-            config = resumed_config(resume, list(HydraConfig.get().overrides.task))
+            overrides = list(HydraConfig.get().overrides.task)
+            # Without a preset a new option is off, as it was when the run began.
+            defaults = hydra.compose("config", ["learner=plain"])
+            config = resumed_config(resume, overrides, defaults=defaults)
         experiment = Experiment(config, resume=resume, say=print)
     folder = experiment.folder.path
     print(f"Run folder: {folder}")

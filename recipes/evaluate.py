@@ -35,7 +35,9 @@ def main(config: DictConfig) -> None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         run = Path(config.run)
         trained = resumed_config(
-            run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]
+            run,
+            [f"device={config.device}", f"evaluation.episodes={config.episodes}"],
+            defaults=hydra.compose("config", ["learner=plain"]),
         )
         experiment = Experiment(trained, resume=run)
         stage = experiment.learned()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, get_args
 
 import torch
@@ -17,7 +16,7 @@ from torchrl_etl.modules.actor_critic import Body
 from torchrl_etl.modules.checks import check_choice
 from torchrl_etl.training.methods import METHODS
 
-__all__ = ["resumed_config", "validate"]
+__all__ = ["bfloat16_warning", "validate"]
 
 _CHOICES = {
     "collector.kind": COLLECTORS,
@@ -109,6 +108,7 @@ _RULES: tuple[_Rule, ...] = (
         lambda v: _integer(v) and 0 <= v < 2**31,
         (
             "seed",
+            "restart_seed",
             "evaluation.every",
             "explore.fit.final_updates",
             "learn.init_random_frames",
@@ -248,48 +248,6 @@ def bfloat16_warning(config: DictConfig) -> str | None:
         "this processor has no instructions for bfloat16, so body=residual_bfloat16 takes longer "
         "than the same in float32, body=residual."
     )
-
-
-def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of an earlier run, with the overrides given now on top.
-
-    Raises:
-        ValueError: if the folder holds no run, or an override would make it another run.
-    """
-    path = Path(folder) / "config.yaml"
-    if not path.is_file():
-        raise ValueError(
-            f"{folder} holds no run (there is no {path.name}); pass the folder that the first run "
-            "printed."
-        )
-    given = [override for override in overrides if not override.startswith("resume=")]
-    for override in given:
-        key = override.partition("=")[0].lstrip("+~")
-        if key in _FIXED or any(part in key.split(".") for part in _FIXED_SECTIONS):
-            raise ValueError(
-                f"{key} cannot be changed when a run is resumed, since its checkpoints were made "
-                "with another; start a new run for that."
-            )
-    config = OmegaConf.load(path)
-    OmegaConf.set_struct(config, True)
-    return OmegaConf.merge(config, OmegaConf.from_dotlist(given))
-
-
-# What the shapes of networks, or the meaning of their weights, depend on.
-_FIXED = ("env", "goal", "action_repeat", "seed", "num_synergies", "synergies", "run_dir")
-_FIXED += ("learn.sac.num_critics", "learn.residual", "learner", "experiment", "faithful")
-_FIXED += ("learn.reuse_exploration", "collector")  # the group; collector.kind may change
-_FIXED_SECTIONS = (
-    "method",
-    "actor",
-    "critic",
-    "encoder",
-    "gmvae",
-    "direction",
-    "metric",
-    "metra",
-    "representation",
-)
 
 
 def _check_collector(collector: DictConfig) -> None:

@@ -22,7 +22,13 @@ from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import actuator_names, episode_length, make_env, resolve_task
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.atomic_files import surviving_folder, write_atomically
-from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
+from torchrl_etl.modules.bundle import (
+    BundleInfo,
+    check_compatible,
+    copy_bundle,
+    load_bundle,
+    save_bundle,
+)
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.evaluation import Evaluation, evaluate
@@ -71,8 +77,9 @@ class Experiment:
         self.method = None  # ETL, whose stages are below
         if config.method.learner != "etl":
             self.method = METHODS[config.method.learner](self)
+        self._bundle = self.path / "synergies"
         if config.synergies is not None:
-            self._take_bundle()
+            self._take_bundle(resume=resume is not None)
         if config.frames is not None:
             self._divide_frames()
         if self.config.num_synergies > len(self.actuators):
@@ -89,6 +96,8 @@ class Experiment:
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
         self.folder.open(resume=self.resume)
+        if self.config.synergies is not None:  # a run holds all it needs, wherever it is moved
+            self._bundle = copy_bundle(self._bundle, self.folder.synergies)
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
         summary: dict[str, Any] = {
@@ -221,8 +230,7 @@ class Experiment:
         return stage
 
     def _decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
-        bundle = self.config.synergies or self.folder.synergies
-        return load_bundle(bundle, residual=self.config.learn.residual)
+        return load_bundle(self._bundle, residual=self.config.learn.residual)
 
     def evaluation_env(self, stage: SACStage) -> EnvBase:
         """One simulator, driven by the stage's decoder if it has one."""
@@ -329,6 +337,7 @@ class Experiment:
             "collector": collector,
             "action_repeat": self.config.action_repeat,
             "compile": compile,
+            "restart_seed": self.config.restart_seed,
             "scratch": self.path / "buffer",
             **options,
         }
@@ -376,10 +385,20 @@ class Experiment:
             )
         self.config.learn.frames = left
 
-    def _take_bundle(self) -> None:
-        """Check the given bundle, and let its own d and its absolute path stand in the config."""
+    def _take_bundle(self, *, resume: bool) -> None:
+        """Check the given bundle, and let its own d and its absolute path stand in the config.
+
+        A run that began with it has a copy; only a run of an earlier version has not.
+        """
         path = Path(self.config.synergies).resolve()
-        _, info = load_bundle(path)
+        if not resume or not surviving_folder(self._bundle.resolve()).exists():
+            if resume and not path.exists():
+                raise FileNotFoundError(
+                    f"{self.path} learns with the synergies of {path}, which is gone; copy that "
+                    f"bundle to {self._bundle}."
+                )
+            self._bundle = path
+        _, info = load_bundle(self._bundle)
         self.config.synergies = str(path)
         self.config.num_synergies = info.num_synergies
         space = self.spec.full_action_spec_unbatched["action"].space

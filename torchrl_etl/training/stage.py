@@ -82,6 +82,8 @@ class Stage(ABC):
         learning_starts (int): frames before the first update.
         reward_scale (float): factor on the task's reward as the buffer keeps it.
         given (int): transitions to make room for beside the budget. Default: 0.
+        restart_seed (int): another one collects other episodes with the same ``seed``, so that a
+            run whose simulation diverges can go on from its checkpoint. Default: 0.
         compile (bool): compile updates; on CUDA they also become one CUDA graph.
             Default: ``False``.
     """
@@ -108,9 +110,11 @@ class Stage(ABC):
         reward_scale: float,
         action_repeat: int = 1,
         given: int = 0,
+        restart_seed: int = 0,
         compile: bool = False,
     ) -> None:
         self.policy, self.seed, self.device = policy, seed, device
+        self.restart_seed = restart_seed
         self.reward_scale = reward_scale
         self.budget = frames
         self.action_repeat = action_repeat
@@ -172,7 +176,7 @@ class Stage(ABC):
         A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
-        seed = training_seed(self.seed, self.frames)
+        seed = training_seed(self.seed, self.frames + 15_485_863 * self.restart_seed)
         if self.batches is None:
             # Only a run that begins or resumes builds a collector: that must not show.
             random = GlobalRNGState().state_dict()
