@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
         resume = None
         if config.resume is not None:
             resume = Path(config.resume)
-            config = resumed_config(resume, given)
+            config = resumed_config(resume, given, defaults=hydra.compose("config"))
         # Two runs that begin in the same second have the same name by default.
         named = any(override.lstrip("+").startswith("run_dir=") for override in given)
         experiment = Experiment(config, resume=resume, unique=not named, say=print)

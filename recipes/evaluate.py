@@ -38,7 +38,9 @@ def main(config: DictConfig) -> None:
         size = check_video_size(config.video_size)
         run = Path(config.run)
         trained = resumed_config(
-            run, [f"device={config.device}", f"evaluation.episodes={config.episodes}"]
+            run,
+            [f"device={config.device}", f"evaluation.episodes={config.episodes}"],
+            defaults=hydra.compose("config"),
         )
         experiment = Experiment(trained, resume=run)
         stage = experiment.learned()

@@ -15,11 +15,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrl_etl.training.learn import LearnStage
 
 from tests.configs import ROOT, TINY, tiny
-from torchrl_etl.experiment import Experiment
 from torchrl_etl.collectors import STOP_SIGNALS
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests

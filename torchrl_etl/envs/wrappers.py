@@ -144,7 +144,7 @@ class FiniteGuard(gym.Wrapper):
     def _error(self, what: str, cure: str | None = None) -> SimulationError:
         seed = "never seeded" if self._seed is None else f"since seed {self._seed}"
         cure = cure or (
-            "if it is rare, resume from a checkpoint with another seed, "
+            "if it is rare, go on with resume=RUN restart_seed=1, which collects other episodes, "
             "otherwise make the actions smaller or smoother"
         )
         return SimulationError(

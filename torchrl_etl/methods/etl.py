@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import safetensors.torch
@@ -17,7 +18,13 @@ from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.method import Method
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import BundleInfo, check_compatible, load_bundle, save_bundle
+from torchrl_etl.modules.bundle import (
+    BundleInfo,
+    check_compatible,
+    copy_bundle,
+    load_bundle,
+    save_bundle,
+)
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
 from torchrl_etl.training.context import Context
@@ -143,7 +150,9 @@ class ETL(Method):
                 " leave it out or use stage=learn."
             )
         if self.given:
-            _, info = load_bundle(config.synergies.bundle)
+            # The absolute path stands in the run's configuration.
+            config.synergies.bundle = str(Path(config.synergies.bundle).expanduser().resolve())
+            _, info = load_bundle(self.bundle)
             config.num_synergies = info.num_synergies
             space = context.spec
             check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
@@ -162,7 +171,22 @@ class ETL(Method):
 
     # Stage 1 -----------------------------------------------------------------------------------
 
+    @property
+    def bundle(self) -> Path:
+        """Where the synergies are: in the run folder, or until they are copied where given."""
+        own, given = self.context.folder.synergies, self.context.config.synergies.bundle
+        if given is None or surviving_folder(own).exists():
+            return own
+        if (self.context.folder.path / "config.yaml").exists() and not Path(given).exists():
+            raise FileNotFoundError(
+                f"{self.context.folder.path} learns with the synergies of {given}, which is gone; "
+                f"copy that bundle to {own}."
+            )
+        return Path(given)
+
     def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+        if self.given:  # a run holds all it needs, wherever it is moved
+            copy_bundle(self.bundle, self.context.folder.synergies)
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             self._explore(stop)
         _, info = self.decoder()
@@ -219,8 +243,7 @@ class ETL(Method):
 
     def decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
         """The decoder that was given or explored, and what is known of it."""
-        bundle = self.context.config.synergies.bundle or self.context.folder.synergies
-        return load_bundle(bundle, residual=self.context.config.learn.decoder.residual)
+        return load_bundle(self.bundle, residual=self.context.config.learn.decoder.residual)
 
     def stage(self) -> Stage:
         if self.given or surviving_folder(self.context.folder.synergies).exists():

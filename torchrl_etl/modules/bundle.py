@@ -26,7 +26,14 @@ from torch import Tensor
 from torchrl_etl.io import replace_folder, surviving_folder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 
-__all__ = ["BundleError", "BundleInfo", "check_compatible", "load_bundle", "save_bundle"]
+__all__ = [
+    "BundleError",
+    "BundleInfo",
+    "check_compatible",
+    "copy_bundle",
+    "load_bundle",
+    "save_bundle",
+]
 
 FORMAT_VERSION = 1
 _TENSORS = "synergies.safetensors"
@@ -224,6 +231,37 @@ def load_bundle(
             "copy the bundle again."
         )
     return decoder, info
+
+
+def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> Path:
+    """Copy a bundle to the folder ``target`` as it is, whole or not at all.
+
+    Args:
+        source (path-like): the bundle's folder, or a run folder.
+        target (path-like): a folder; a bundle that is there already is replaced.
+
+    Returns:
+        Path: the folder.
+
+    Raises:
+        BundleError: if there is no bundle at ``source``, or it is damaged.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from torchrl_etl.modules import SynergyDecoder
+        >>> with TemporaryDirectory() as root:
+        ...     decoder = SynergyDecoder(1, 2)
+        ...     run = save_bundle(decoder, f"{root}/a", task="toy", actuators=["x", "y"])
+        ...     _, info = load_bundle(copy_bundle(run, f"{root}/b"))
+        >>> info.task
+        'toy'
+    """
+    load_bundle(source)
+    folder, target = _find_folder(Path(source)), Path(target).resolve()
+    if folder != target:
+        names = (_TENSORS, _DESCRIPTION)
+        replace_folder(target, {name: (folder / name).read_bytes() for name in names})
+    return target
 
 
 def check_compatible(

@@ -1,10 +1,11 @@
 """What runs a learner: a stage, the loop around it, checkpoints, evaluation, queues of runs."""
 
 from torchrl_etl.training.bench import Bench, Run
-from torchrl_etl.training.config import resumed_config, validate
+from torchrl_etl.training.config import validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import Interrupted
+from torchrl_etl.training.resumed import resumed_config
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.video import check_video_size, record_episodes
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from torchrl.data import ReplayBuffer
 
-from torchrl_etl.io import require_room, write_atomically
+from torchrl_etl.io import flush_folder, require_room, write_atomically
 
 __all__ = ["Checkpoints"]
 
@@ -31,8 +31,8 @@ class Checkpoints(CheckpointRotation):
 
     ``torchrl.checkpoint`` (0.14.1) publishes a folder by an atomic rename, but neither flushes
     its files to disk nor notices a damaged one. Here every file is flushed and its SHA-256 goes
-    into ``seal.json``, written last; a checkpoint whose seal is missing or does not match is
-    passed over for the one before.
+    into ``seal.json``, before the folder gets its name: whatever has the name of a checkpoint was
+    whole once, and one whose seal is missing or does not match is passed over for the one before.
 
     Args:
         directory (path): where the checkpoints of one stage live.
@@ -46,12 +46,24 @@ class Checkpoints(CheckpointRotation):
         self._remove_leftovers()
         # TorchRL writes tensors through maps of sparse files, which a full disk makes deadly.
         require_room(self.directory, _size(checkpoint.components) + _SMALL_FILES)
+        folder = self._checkpoint_path(step, "directory")
+        fresh = folder.with_name(f".{folder.name}.stage-unsealed")
         try:
-            folder = super().save(checkpoint, step=step, **kwargs)
+            checkpoint.save(fresh, **kwargs)
         except RuntimeError as error:  # how PyTorch says that the disk is full
             raise OSError(f"A checkpoint cannot be written to {self.directory}: {error}") from error
-        write_atomically(folder / _SEAL, json.dumps(_digests(folder, flush=True), indent=1))
+        write_atomically(fresh / _SEAL, json.dumps(_digests(fresh, flush=True), indent=1))
+        if folder.exists():  # a damaged one, which a resumed run passed over
+            self._remove_atomically(folder)
+        os.replace(fresh, folder)
+        flush_folder(self.directory)
+        self.prune()
         return folder
+
+    def checkpoints(self) -> tuple[Path, ...]:
+        """All checkpoints by frame; TorchRL passes over those whose manifest is damaged."""
+        named = self.directory.glob(f"{self.prefix}-*")
+        return tuple(sorted(path for path in named if path.name.rpartition("-")[2].isdigit()))
 
     def newest_whole(self) -> Path | None:
         """The newest checkpoint that is whole; a damaged newer one is named in a warning."""
@@ -69,13 +81,19 @@ class Checkpoints(CheckpointRotation):
         """Restore the newest whole checkpoint; False if none was ever finished.
 
         Raises:
-            OSError: if there are checkpoints and none is whole; beginning anew in their place
-                would delete what is left of them.
+            OSError: if there are checkpoints and none is whole (beginning anew in their place
+                would delete what is left of them), or if it is one of another configuration.
         """
         folder = self.newest_whole()
         if folder is not None:
-            checkpoint.load(folder)
-        elif any((path / _SEAL).exists() for path in self.checkpoints()):
+            try:
+                checkpoint.load(folder)
+            except CheckpointError as error:
+                raise OSError(
+                    f"Checkpoint {folder} does not fit the run as it is configured now ({error}); "
+                    "resume without the settings that were changed."
+                ) from error
+        elif self.checkpoints():
             raise OSError(
                 f"All checkpoints in {self.directory} are damaged; move that folder away to begin "
                 "this stage anew."
@@ -105,12 +123,13 @@ def _size(value: Any) -> int:
 def _digests(folder: Path, *, flush: bool = False) -> dict[str, str]:
     digests = {}
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.name not in (_SEAL, f".{_SEAL}.tmp"):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and name not in (_SEAL, f".{_SEAL}.tmp"):
             with path.open("rb") as file:
                 if flush:
                     os.fsync(file.fileno())
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
-            digests[path.relative_to(folder).as_posix()] = digest
+            digests[name] = digest
     return digests
 
 
@@ -118,13 +137,14 @@ def _fault(folder: Path) -> str | None:
     """What is wrong with a checkpoint folder, or None."""
     try:
         sealed = json.loads((folder / _SEAL).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return f"{_SEAL} is missing or unreadable: it was not written to the end"
+        found = _digests(folder)
+    except (OSError, ValueError) as error:
+        return f"{_SEAL} or another file cannot be read: {error}"
+    if not isinstance(sealed, dict):
+        return f"{_SEAL} holds no digests"
     foreign = [name for name in sealed if Path(name).suffix not in _PLAIN_FILES]
     if foreign:
         return f"{foreign[0]} is not a kind of file that a checkpoint holds"
-    found = _digests(folder)
-    if found != sealed:
-        names = sorted(found.items() ^ sealed.items())
-        return f"{names[0][0]} is not as it was written"
-    return None
+    names = sorted(found.keys() | sealed.keys())
+    other = next((name for name in names if found.get(name) != sealed.get(name)), None)
+    return None if other is None else f"{other} is not as it was written"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -19,7 +17,7 @@ from torchrl_etl.checks import (
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 
-__all__ = ["MAY_CHANGE", "RENAMED", "resumed_config", "validate"]
+__all__ = ["MAY_CHANGE", "RENAMED", "bfloat16_warning", "validate"]
 
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
 
@@ -52,7 +50,17 @@ RENAMED = {
 """Settings by their names of before, and what they are called now."""
 
 MAY_CHANGE = (
-    *("frames", "stage", "device", "threads", "compile", "log", "logger_kwargs", "log_every"),
+    *(
+        "frames",
+        "stage",
+        "restart_seed",
+        "device",
+        "threads",
+        "compile",
+        "log",
+        "logger_kwargs",
+        "log_every",
+    ),
     *("progress", "pictures", "vaf_curve", "evaluation", "checkpoint", "ray", "distributed"),
     *(f"collector.{key}" for key in ("kind", "ahead", "timeout", "num_workers")),
     *(
@@ -91,7 +99,8 @@ def validate(config: DictConfig) -> None:
     for name in ("frames", "threads"):
         if config[name] is not None:
             check_integer(1, **{name: config[name]})
-    check_integer(0, seed=config.seed, **{"evaluation.every": config.evaluation.every})
+    check_integer(0, seed=config.seed, restart_seed=config.restart_seed)
+    check_integer(0, **{"evaluation.every": config.evaluation.every})
     if config.seed >= 2**31:
         raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
     check_integer(
@@ -135,31 +144,6 @@ def bfloat16_warning(config: DictConfig) -> str | None:
         "this processor has no instructions for bfloat16, so body=residual_bfloat16 takes longer "
         "than the same in float32, body=residual."
     )
-
-
-def resumed_config(folder: Path, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of an earlier run, with the overrides given now on top.
-
-    Raises:
-        ValueError: if the folder holds no run, or an override would make it another run.
-    """
-    path = Path(folder) / "config.yaml"
-    if not path.is_file():
-        raise ValueError(
-            f"{folder} holds no run (there is no {path.name}); pass the folder that the first run "
-            "printed."
-        )
-    given = [override for override in overrides if not override.startswith("resume=")]
-    for override in given:
-        key = override.partition("=")[0].lstrip("+~")
-        if not any(key == allowed or key.startswith(f"{allowed}.") for allowed in MAY_CHANGE):
-            raise ValueError(
-                f"{key} cannot be changed when a run is resumed, since its checkpoints were made "
-                f"with another; start a new run for that. What may change: {', '.join(MAY_CHANGE)}."
-            )
-    config = OmegaConf.load(path)
-    OmegaConf.set_struct(config, True)
-    return OmegaConf.merge(config, OmegaConf.from_dotlist(given))
 
 
 def _check_collector(collector: DictConfig) -> None:

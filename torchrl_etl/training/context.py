@@ -135,6 +135,7 @@ class Context:
             "seed": stage_seed(self.config.seed, section),
             "device": self.device,
             "action_repeat": self.config.action_repeat,
+            "restart_seed": self.config.restart_seed,
             "scratch": self.folder.path / "buffer",
             "collector": collector,
         }

@@ -81,6 +81,8 @@ class Stage:
         transforms (sequence of Transform): what each sampled batch goes through.
         prefill_size (int): transitions to make room for beside the budget. Default: 0.
         action_repeat (int): frames that a transition of the collector takes. Default: 1.
+        restart_seed (int): another one collects other episodes with the same ``seed``, so that a
+            run whose simulation diverges can go on from its checkpoint. Default: 0.
 
     Raises:
         ValueError: naming the argument that cannot be used.
@@ -108,6 +110,7 @@ class Stage:
         transforms: Sequence[Transform] = (),
         prefill_size: int = 0,
         action_repeat: int = 1,
+        restart_seed: int = 0,
     ) -> None:
         check_integer(1, frames=frames, n_steps=n_steps)
         check_integer(2, batch_size=batch_size, buffer_size=buffer_size)
@@ -116,6 +119,7 @@ class Stage:
         check_choice("buffer_storage", buffer_storage, ("memory", "memmap"))
         self.name, self.learner, self.seed, self.device = name, learner, seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
+        self.restart_seed = restart_seed
         self.replay_ratio, self.learning_starts = replay_ratio, learning_starts
         self.progress = Progress()
         self.batches: Batches | None = None
@@ -221,7 +225,7 @@ class Stage:
         self.learner.restart(self.frames // self._frames_per_action)
         if self.multi_step is not None:
             self.multi_step.forget()
-        seed = training_seed(self.seed, self.frames)
+        seed = training_seed(self.seed, self.frames + 15_485_863 * self.restart_seed)
         if self.batches is None:
             # Only a run that begins or resumes builds a collector: that must not show.
             random = GlobalRNGState().state_dict()

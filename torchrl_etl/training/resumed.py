@@ -1,0 +1,131 @@
+"""The configuration that a run goes on with: its own, and what is asked for now."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Container, Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from torchrl_etl.training.config import MAY_CHANGE, RENAMED
+
+__all__ = ["resumed_config"]
+
+# Where settings of other libraries go, by names that are not ours.
+_OPEN_SECTIONS = ("logger_kwargs", "env_kwargs", "ray", "distributed")
+
+
+def resumed_config(
+    folder: Path, overrides: Sequence[str] = (), *, defaults: DictConfig | None = None
+) -> DictConfig:
+    """The configuration of an earlier run, with the overrides given now on top.
+
+    Args:
+        folder (path): the run folder.
+        overrides (sequence of str): in Hydra's form.
+
+    Keyword Args:
+        defaults (DictConfig, optional): what settings are taken from that the run's release did
+            not have yet; a warning names them.
+
+    Raises:
+        ValueError: if the folder holds no run, its configuration is damaged, or an override is
+            unknown or would make it another run.
+    """
+    config = _stored(Path(folder) / "config.yaml")
+    newer = {} if defaults is None else dict(_missing(config, defaults))
+    for key, value in newer.items():
+        OmegaConf.update(config, key, value, force_add=True)
+    given = [override for override in overrides if not override.startswith("resume=")]
+    try:
+        parsed = OverridesParser.create().parse_overrides(given)
+    except HydraException as error:
+        raise ValueError(f"{error}".splitlines()[0]) from error
+    for override in parsed:
+        _override(config, override, newer)
+    keys = {override.key_or_group for override in parsed}
+    if {"frames", "learn.frames"} <= keys:
+        raise ValueError("frames and learn.frames were given, and each sets the budget; give one.")
+    if "learn.frames" in keys:  # the newer of the two settings counts
+        config.frames = None
+    if taken := [f"{key}={value}" for key, value in newer.items() if key not in keys]:
+        warnings.warn(
+            f"{folder} is of a release that did not have {', '.join(taken)}; these defaults hold.",
+            stacklevel=2,
+        )
+    OmegaConf.set_struct(config, True)
+    return config
+
+
+def _stored(path: Path) -> DictConfig:
+    if not path.is_file():
+        raise ValueError(
+            f"{path.parent} holds no run (there is no {path.name}); pass the folder that the first "
+            "run printed."
+        )
+    try:
+        config = OmegaConf.load(path)
+        fault = None
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        config, fault = None, " ".join(str(error).split())
+    if fault is None and not isinstance(config, DictConfig):
+        fault = "it holds no settings"
+    if fault is None:
+        # Every release had these, and they come last in the file, or make a run what it is.
+        lost = [
+            key for key in ("env", "seed", "explore", "learn", "checkpoint") if key not in config
+        ]
+        fault = f"it lacks {', '.join(lost)}" if lost else None
+    if fault is None and (old := [k for k in RENAMED if OmegaConf.select(config, k) is not None]):
+        raise ValueError(
+            f"{path} is of a release whose settings had other names ({old[0]}, now "
+            f"{RENAMED[old[0]]}); go on with that release, or start a new run."
+        )
+    if fault is not None:
+        raise ValueError(
+            f"{path} is damaged ({fault}); copy it from a backup of the run, or start a new run."
+        )
+    return config
+
+
+def _missing(config: DictConfig, defaults: DictConfig) -> Iterator[tuple[str, Any]]:
+    """Settings that only ``defaults`` has, whole sections as one, with their values."""
+
+    def walk(have: Any, want: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        for key, value in want.items():
+            if key not in have:
+                yield f"{prefix}{key}", value
+            elif isinstance(value, dict) and isinstance(have[key], dict):
+                yield from walk(have[key], value, f"{prefix}{key}.")
+
+    return walk(OmegaConf.to_container(config), OmegaConf.to_container(defaults), "")
+
+
+def _override(config: DictConfig, override: Override, newer: Container[str]) -> None:
+    """Set what an override asks for."""
+    key = override.key_or_group
+    section, _, name = key.rpartition(".")
+    parent = OmegaConf.select(config, section) if section else config
+    known = isinstance(parent, DictConfig) and name in parent
+    if override.is_delete():
+        raise ValueError(f"~{key} would take a setting away, which a run needs; give it a value.")
+    if known and override.is_add() and not override.is_force_add():
+        raise ValueError(f"+{key} is a setting that is there already; leave the plus out.")
+    if not known and (not override.is_add() or key.split(".")[0] not in _OPEN_SECTIONS):
+        near = get_close_matches(key, [f"{section}.{k}".lstrip(".") for k in parent or ()], n=1)
+        hint = f"did you mean {near[0]}?" if near else "see its config.yaml."
+        raise ValueError(f"The run has no setting {key!r}; {hint}")
+    if key not in newer and not any(f"{key}.".startswith(f"{may}.") for may in MAY_CHANGE):
+        raise ValueError(
+            f"{key} cannot be changed when a run is resumed, since its checkpoints were made "
+            f"with another; start a new run for that. What may change: {', '.join(MAY_CHANGE)}."
+        )
+    OmegaConf.update(config, key, override.value(), force_add=True)
