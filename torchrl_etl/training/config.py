@@ -82,7 +82,6 @@ _RULES: tuple[_Rule, ...] = (
         "a whole number above 0",
         lambda v: _integer(v) and v > 0,
         (
-            "num_synergies",
             "action_repeat",
             "collector.num_envs",
             "collector.num_workers",
@@ -91,7 +90,6 @@ _RULES: tuple[_Rule, ...] = (
             "evaluation.episodes",
             "checkpoint.every",
             "vaf_curve.updates",
-            "explore.encoder.embedding_dim",
             "learn.critic.bins",
             "learn.sac.hold.longest",
             "learn.sac.n_steps",
@@ -118,7 +116,14 @@ _RULES: tuple[_Rule, ...] = (
     (
         "a whole number above 0 or null",
         lambda v: v is None or (_integer(v) and v > 0),
-        ("frames", "threads", "explore.gmvae.num_components", "explore.direction.num_directions"),
+        (
+            "num_synergies",
+            "frames",
+            "threads",
+            "explore.encoder.embedding_dim",  # num_synergies, unless it is set
+            "explore.gmvae.num_components",
+            "explore.direction.num_directions",
+        ),
     ),
     (
         "a number above 0",

@@ -35,7 +35,20 @@ from torchrl_etl.training.sac import SACStage
 from torchrl_etl.training.synergy_report import describe_synergies, draw_synergies
 from torchrl_etl.transforms import SynergyAction
 
-__all__ = ["Experiment"]
+__all__ = ["MOST_SYNERGIES", "Experiment", "default_num_synergies"]
+
+MOST_SYNERGIES = 8
+"""d of bodies with at least twice as many actuators, among them all of the paper's tasks."""
+
+
+def default_num_synergies(actuators: int) -> int:
+    """d for a body: half of its actuators, between 1 and 8.
+
+    Examples:
+        >>> [default_num_synergies(n) for n in (1, 6, 21, 80)]
+        [1, 3, 8, 8]
+    """
+    return min(MOST_SYNERGIES, max(1, actuators // 2))
 
 
 class Experiment:
@@ -75,11 +88,7 @@ class Experiment:
             self._take_bundle()
         if config.frames is not None:
             self._divide_frames()
-        if self.config.num_synergies > len(self.actuators):
-            raise ValueError(
-                f"num_synergies is {config.num_synergies} but {config.env} has "
-                f"{len(self.actuators)} actuators; choose at most that many."
-            )
+        self._settle_num_synergies()
         self._build_once()
         self.resume = resume is not None
         self.folder = RunFolder(self.path, self.config)
@@ -235,6 +244,7 @@ class Experiment:
             evaluate,
             stage.trained_policy,
             self.evaluation_env(stage),
+            solved_steps=self.task.solved_steps,
             episodes=self.config.evaluation.episodes,
             max_steps=steps,
             action_repeat=self.config.action_repeat,
@@ -293,7 +303,7 @@ class Experiment:
             rows,
             self.folder.pictures / "learning_curves.png",
             explore_frames=charged or None,
-            title=f"{self.config.env} ({self.task.goal} goal)",
+            title=f"{self.config.env}{self.task.goal_in_words}",
         )
 
     # Shared ------------------------------------------------------------------------------------
@@ -355,6 +365,22 @@ class Experiment:
     @property
     def _shows_activations(self) -> bool:
         return self.config.explore.fit.actions == "activation"
+
+    def _settle_num_synergies(self) -> None:
+        """Without a number, take one for the body; refuse more synergies than actuators to ETL."""
+        given, actuators = self.config.num_synergies, len(self.actuators)
+        if given is None:
+            self.config.num_synergies = default_num_synergies(actuators)
+            if self.method is None and self.config.num_synergies < MOST_SYNERGIES:
+                self.say(
+                    f"num_synergies is {self.config.num_synergies}, as {self.config.env} has "
+                    f"{actuators} actuators."
+                )
+        elif self.method is None and given > actuators:
+            raise ValueError(
+                f"num_synergies is {given} but {self.config.env} has {actuators} actuators; "
+                "choose at most that many, or null for a number that fits."
+            )
 
     def _divide_frames(self) -> None:
         """Leave to stage 2 what stage 1 does not take."""
