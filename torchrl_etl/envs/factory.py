@@ -226,7 +226,7 @@ def _build(
 
 
 def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
-    """Builds the environment, its action flat; also returns the exceptions by which it reports divergence."""
+    """Builds the environment, its action flat; also returns what it raises when it diverges."""
     if task.suite == "dm_control":
         suite = dm_control_suite()
         from dm_control.rl.control import PhysicsError

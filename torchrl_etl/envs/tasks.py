@@ -170,8 +170,8 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
     Args:
         name (str): a short name of :func:`list_tasks`, ``"myo2HandPose"`` or ``"overactuated"``;
             any environment id registered with Gymnasium (MyoSuite's are registered on demand;
-            ``"module:id"`` imports ``module`` first, from the current folder too); or any DMControl ``"domain-task"``, e.g.
-            ``"cheetah-run"``.
+            ``"module:id"`` imports ``module`` first, from the current folder too); or any
+            DMControl ``"domain-task"``, e.g. ``"cheetah-run"``.
         goal (str, optional): ``"fixed"`` or ``"random"``. ``None`` (default) is the fixed goal for
             a short name, and for an id what ``Fixed`` or ``Random`` in it says.
 
