@@ -35,7 +35,7 @@ CONF = HERE / "conf"
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="bench")
 def main(config: DictConfig) -> None:
-    with one_sentence(ValueError, OSError, RuntimeError, HydraException):
+    with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
         runs = queue(config)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         bench = Bench(runs, Path(config.out), jobs=config.jobs or cores, attempts=config.attempts)
@@ -74,7 +74,7 @@ def queue(config: DictConfig) -> list[Run]:
     folder = Path(config.out).resolve()
     runs = []
     for seed, task, method in product(config.seeds, config.tasks, config.methods):
-        name, _, goal = str(task).partition(":")
+        name, goal = split_goal(str(task))
         overrides = [f"env={name}", f"method={method}", f"seed={seed}", f"frames={config.frames}"]
         overrides += [f"goal={goal}"] if goal else []
         overrides += [
@@ -84,11 +84,19 @@ def queue(config: DictConfig) -> list[Run]:
             "log=[]",
             *shlex.split(config.settings),
         ]
-        path = folder / "-".join(filter(None, (name, goal, method, f"seed{seed}")))
+        path = folder / "-".join(
+            filter(None, (name.replace(":", "-"), goal, method, f"seed{seed}"))
+        )
         command = [str(HERE / "etl_sac.py"), *overrides]
         runs.append(Run(name, goal or None, method, seed, path, command))
         validate(compose(overrides))  # every one of them, before the first begins
     return runs
+
+
+def split_goal(task: str) -> tuple[str, str]:
+    """``TASK:random`` is a task and its goal; ``module:id``, of one's own, is a task."""
+    name, _, goal = task.rpartition(":")
+    return (name, goal) if goal in ("fixed", "random") else (task, "")
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:

@@ -64,7 +64,8 @@ def main(config: DictConfig) -> None:
 def report(summary: dict[str, Any], folder: Path) -> str:
     """What a person wants to know at the end of a run."""
     synergies, learned = summary.get("synergies", {}), summary.get("learn", {})
-    lines = ["", f"{summary['env']} ({summary['goal']} goal), seed {summary['seed']}"]
+    goal = f" ({summary['goal']} goal)" if summary["goal"] else ""
+    lines = ["", f"{summary['env']}{goal}, seed {summary['seed']}"]
     # A bundle from elsewhere holds what whoever saved it chose to.
     known = [f"{words} {synergies[key]:.2f}" for key, words in SYNERGIES if key in synergies]
     if known:

@@ -48,7 +48,7 @@ def main(config: DictConfig) -> None:
     result = {"env": trained.env, "goal": experiment.task.goal, **evaluation.summary()}
     path = experiment.folder.write_json("evaluation.json", result)
     print(
-        f"{trained.env} ({experiment.task.goal} goal), deterministic policy, "
+        f"{trained.env}{experiment.task.goal_in_words}, deterministic policy, "
         f"{config.episodes} episodes"
     )
     for key in ("return", "solved", "solved_time"):

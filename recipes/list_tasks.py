@@ -34,7 +34,10 @@ def main() -> None:
         cells = zip(row, widths, strict=True)
         # Words to the left, numbers to the right.
         print("  ".join(c.rjust(w) if i > 2 else c.ljust(w) for i, (c, w) in enumerate(cells)))
-    print("\nAny Gymnasium id with continuous actions and any DMControl domain-task work too.")
+    print(
+        "\nAny Gymnasium id with continuous actions and any DMControl domain-task work too,\n"
+        "and module:id, which imports the module that registers a task of your own."
+    )
 
 
 if __name__ == "__main__":

@@ -15,12 +15,12 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import RewardSum, TransformedEnv
-from torchrl_etl.training.sac import episodes
 
 from tests.point_env import PointTask
 from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
+from torchrl_etl.learners.sac import episode_numbers
 from torchrl_etl.modules import make_actor
 
 FRAMES = 48
@@ -116,7 +116,7 @@ def test_the_number_of_an_episode_tells_which_return_a_batch_of_any_worker_goes_
     for _ in range(12):
         batch = batches.next()
         rewards, sums = batch["next", "reward"], batch["next", "episode_reward"]
-        rows = zip(episodes(batch), rewards, sums, strict=True)
+        rows = zip(episode_numbers(batch), rewards, sums, strict=True)
         for simulator in rows:
             for number, reward, so_far in zip(*simulator, strict=True):
                 before = returns.get(int(number), 0.0)

@@ -19,6 +19,7 @@ import torch
 from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.learners import SACLearner
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
@@ -271,15 +272,15 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
 def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_path, monkeypatch):
     run = tmp_path / "run"
     experiment = Experiment(tiny(f"run_dir='{run}'", "learn.prefill=true"))
-    update, updates = LearnStage.update, []
+    update, updates = SACLearner.update, []
 
-    def update_and_signal(self):
+    def update_and_signal(self, batch):
         updates.append(update(self))
         if len(updates) == 20:
             os.kill(os.getpid(), signal.SIGINT)
         return updates[-1]
 
-    monkeypatch.setattr(LearnStage, "update", update_and_signal)
+    monkeypatch.setattr(SACLearner, "update", update_and_signal)
     with pytest.raises(Interrupted):
         experiment.run()
     assert len(updates) < 40

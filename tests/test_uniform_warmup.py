@@ -7,10 +7,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
-from torchrl_etl.training.sac import frames_per_action
 
 from tests.stages import learn_stage
 from torchrl_etl.modules import UniformWarmup
+from torchrl_etl.training.stage import frames_per_action
 
 RANDOM = set_exploration_type(ExplorationType.RANDOM)
 

@@ -107,6 +107,7 @@ class Experiment:
             evaluate,
             stage.learner.policy,
             self.context.make_env(),
+            solved_steps=self.task.solved_steps,
             episodes=self.config.evaluation.episodes,
             max_steps=steps or episode_length(self.config.env, self.config.goal) or 1000,
             action_repeat=self.config.action_repeat,
@@ -150,7 +151,7 @@ class Experiment:
             rows,
             self.folder.pictures / "learning_curves.png",
             explore_frames=charged or None,
-            title=f"{self.config.env} ({self.task.goal} goal)",
+            title=f"{self.config.env}{self.task.goal_in_words}",
         )
 
     def _divide_frames(self) -> None:

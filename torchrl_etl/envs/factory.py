@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +15,7 @@ from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
+from torchrl_etl.envs.action_space import FlatAction, check_action_space
 from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
 from torchrl_etl.envs.simulator import simulator
@@ -30,6 +32,9 @@ from torchrl_etl.envs.wrappers import (
 
 __all__ = ["actuator_names", "make_env"]
 
+_LONGEST_SEARCH = 1000
+"""Steps of the episode in which a task's success is looked for."""
+
 
 def make_env(
     name: str,
@@ -41,6 +46,7 @@ def make_env(
     activations: bool = False,
     muscle_lengths: bool = False,
     action_repeat: int = 1,
+    success_key: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """Builds a task as a TorchRL environment.
@@ -71,6 +77,9 @@ def make_env(
             metres (MyoSuite only). Defaults to ``False``.
         action_repeat (int): simulator steps for which every action is taken; their rewards add up,
             and an episode's time limit still counts simulator steps. Defaults to 1.
+        success_key (str, optional): the entry of ``info`` that means success. Default: the
+            task's own, or else the first of ``solved``, ``is_success`` and ``success`` that an
+            episode of uniform actions (of 1,000 steps at most) shows.
         env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
             ``dm_control.suite.load``.
 
@@ -79,7 +88,7 @@ def make_env(
 
     Keys:
         - ``observation`` [O], float32, flat. DMControl's parts are joined in alphabetical order.
-        - ``action`` [n], float32, within the bounds that the simulator declares: [-1, 1] for
+        - ``action`` [n], float32, flat, within the bounds that the simulator declares: [-1, 1] for
           MyoSuite's hands and arm and for DMControl, [0, 1] for MyoSuite's legs.
         - ``reward`` [1]; ``done``, ``terminated``, ``truncated`` [1]. Time limits truncate.
         - ``solved`` [1], bool, where the task defines it: whether this very step meets the task's
@@ -89,7 +98,8 @@ def make_env(
 
     Raises:
         ValueError: for an unknown name, a goal that the task lacks, ``env_kwargs`` that it does not
-            take, or actions that are not continuous. While it runs, the environment raises
+            take, or actions that are not continuous, not bounded, or cannot move. While it runs,
+            the environment raises
             :class:`~torchrl_etl.envs.SimulationError` if a value is not finite.
 
     Examples:
@@ -114,6 +124,7 @@ def make_env(
         env_kwargs=dict(env_kwargs or {}),
     )
     with quiet_compiler(), _argument_errors(task, env_kwargs):
+        build = partial(build, success_key=success_key or _success_key(task, env_kwargs))
         if num_envs == 1:
             env = GymWrapper(build(), device=device)
         else:
@@ -135,7 +146,8 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
 
     Returns:
         list of str: one name for each entry of the action; ``actuator_0`` and so on where there is
-        no MuJoCo model to read them from.
+        no MuJoCo model to read them from. Of a model with more actuators than the action has
+        entries, the muscles are named if they are as many as the action, otherwise none.
 
     Examples:
         >>> from torchrl_etl.envs import actuator_names
@@ -149,7 +161,14 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
             return actuator_names(built)
         finally:
             built.close()
-    names = _raw_actuator_names(simulator(env))
+    simulation = simulator(env)
+    names = _raw_actuator_names(simulation)
+    count = math.prod(simulation.action_space.shape)
+    if len(names) > count:  # the simulator itself drives the rest: a prosthesis, for one
+        first = getattr(getattr(simulation, "model", None), "actuator_actadr", ())
+        names = [name for name, at in zip(names, first, strict=False) if at >= 0]
+    if len(names) != count:
+        return [f"actuator_{i}" for i in range(count)]
     if len(set(names)) < len(names):  # some models name no actuator, or two alike
         names = [f"{name or 'actuator'}_{i}" for i, name in enumerate(names)]
     if all(name.endswith("_r") for name in names):
@@ -193,7 +212,7 @@ def _raw_actuator_names(simulation: Any) -> list[str]:
         return [model.id2name(i, "actuator") for i in range(model.nu)]
     model = getattr(simulation, "model", None)
     if not hasattr(model, "actuator"):
-        return [f"actuator_{i}" for i in range(simulation.action_space.shape[0])]
+        return []
     return [model.actuator(i).name for i in range(model.nu)]
 
 
@@ -203,19 +222,10 @@ def _build(
     activations: bool,
     muscle_lengths: bool,
     action_repeat: int,
+    success_key: str | None,
     env_kwargs: dict[str, Any],
 ) -> gym.Env:
     env, faults = _simulator(task, env_kwargs)
-    if not isinstance(env.action_space, spaces.Box):
-        space = env.action_space
-        env.close()
-        raise ValueError(
-            f"{task.name} has the action space {space}; a synergy is a direction among "
-            "continuous actuators, so choose a task whose actions are a Box."
-        )
-    success_key = "solved" if task.solved else None
-    if task.solved is None:
-        success_key = _probe_success(env)
     space = env.observation_space
     if isinstance(space, spaces.Dict) and all(isinstance(s, spaces.Box) for s in space.values()):
         env = FlatObservation(env)
@@ -232,22 +242,45 @@ def _build(
 
 
 def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
-    """Builds the bare environment; also returns the exceptions by which it reports divergence."""
+    """Builds the environment, its action flat; also returns what it raises when it diverges."""
     if task.suite == "dm_control":
         suite = dm_control_suite()
         from dm_control.rl.control import PhysicsError
         from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
         domain, task_name = task.env_id.split("-", 1)
-        env = suite.load(domain, task_name, **env_kwargs)
-        return DmControlCompatibilityV0(env), (PhysicsError,)
-    if task.suite == "myosuite":
-        register_myosuite()
-    # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
-    return gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
+        env = DmControlCompatibilityV0(suite.load(domain, task_name, **env_kwargs))
+        faults = (PhysicsError,)
+    else:
+        if task.suite == "myosuite":
+            register_myosuite()
+        # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
+        env, faults = gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
+    try:
+        check_action_space(env.action_space, task.name)
+    except ValueError:
+        env.close()
+        raise
+    return env if len(env.action_space.shape) == 1 else FlatAction(env), faults
 
 
-def _probe_success(env: gym.Env) -> str | None:
-    env.reset(seed=0)
-    info = env.step(env.action_space.sample())[-1]
-    return next((key for key in SUCCESS_KEYS if key in info), None)
+def _success_key(task: Task, env_kwargs: Mapping[str, Any] | None) -> str | None:
+    """The task's own key, or the one seen in an episode of a simulator that is then thrown away.
+
+    Some tasks tell of success in the last ``info`` only. Nothing of the search, its seed least of
+    all, must reach the simulators that are used.
+    """
+    if task.solved is not None:
+        return "solved" if task.solved else None
+    env = _simulator(task, dict(env_kwargs or {}))[0]
+    try:
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(_LONGEST_SEARCH):
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            found = next((key for key in SUCCESS_KEYS if key in info), None)
+            if found is not None or terminated or truncated:
+                return found
+        return None
+    finally:
+        env.close()

@@ -7,7 +7,6 @@ before workers start.
 from __future__ import annotations
 
 import difflib
-import importlib
 import re
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -15,6 +14,7 @@ from typing import Literal
 import gymnasium as gym
 
 from torchrl_etl.envs.myosuite import register_myosuite
+from torchrl_etl.envs.own_tasks import import_own_task
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
 
 __all__ = ["Task", "episode_length", "list_tasks", "resolve_task"]
@@ -34,8 +34,10 @@ class Task:
         episode_steps: Number of steps after which an episode is truncated, ``None`` if it never is
             (or, for DMControl domains outside the paper, not known before the task is built).
         solved: Whether the task says when it is solved; ``None`` means that :func:`make_env`
-            finds out with one step.
-        goal: Which of the two goals is meant.
+            finds out in an episode of uniform actions.
+        solved_steps: On how many steps an episode must be solved to count as solved;
+            ``None`` means on its last.
+        goal: Which of the two goals is meant; ``None`` where an id says neither.
         ends_early: Whether an episode can end before its time; if not, the simulation goes on.
 
     Examples:
@@ -50,7 +52,8 @@ class Task:
     suite: Literal["myosuite", "dm_control", "gymnasium"] = "gymnasium"
     episode_steps: int | None = None
     solved: bool | None = None
-    goal: Goal = "fixed"
+    solved_steps: int | None = None
+    goal: Goal | None = "fixed"
     ends_early: bool = True
 
     @property
@@ -59,17 +62,32 @@ class Task:
         return self.random_id if self.goal == "random" and self.random_id else self.id
 
     @property
+    def goal_in_words(self) -> str:
+        """``" (fixed goal)"`` and so on, for messages; empty where neither goal is meant."""
+        return f" ({self.goal} goal)" if self.goal else ""
+
+    @property
     def goals(self) -> tuple[Goal, ...]:
         """The goals that the task offers."""
-        return ("fixed", "random") if self.random_id else ("fixed",)
+        if self.random_id:
+            return ("fixed", "random")
+        return ("random",) if "Random" in self.id else ("fixed",)
+
+
+_MYOSUITE_STEPS = 6
+"""MyoSuite's ``evaluate_success`` asks for more than five solved steps."""
+
+_SOLVED_ONCE = re.compile(r"myo\w*Challenge(ChaseTag|Soccer|TableTennis|OslRun)")
+"""MyoChallenge's tasks that end with their success, which its ``get_metrics`` counts."""
 
 
 def _hand(name: str, steps: int) -> Task:
-    return Task(name, f"{name}Fixed-v0", f"{name}Random-v0", "myosuite", steps, True)
+    ids = f"{name}Fixed-v0", f"{name}Random-v0"
+    return Task(name, *ids, "myosuite", steps, True, _MYOSUITE_STEPS)
 
 
 def _myo(name: str, env_id: str, steps: int) -> Task:
-    return Task(name, env_id, None, "myosuite", steps, True)
+    return Task(name, env_id, None, "myosuite", steps, True, _MYOSUITE_STEPS)
 
 
 def _dm_control(name: str) -> Task:
@@ -99,6 +117,7 @@ _ANALYTIC = Task(
     "gymnasium",
     25,
     True,
+    6,
 )
 
 # Their rewards are negative and a drop ends them, so that dropping early can pay. Where it ends
@@ -117,6 +136,7 @@ _MYO2 = Task(
     "myosuite",
     100,
     True,
+    _MYOSUITE_STEPS,
 )
 
 _BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _MYO2, _ANALYTIC)}
@@ -150,13 +170,13 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
     Args:
         name (str): a short name of :func:`list_tasks`, ``"myo2HandPose"`` or ``"overactuated"``;
             any environment id registered with Gymnasium (MyoSuite's are registered on demand;
-            ``"module:id"`` imports ``module`` first); or any DMControl ``"domain-task"``, e.g.
-            ``"cheetah-run"``.
+            ``"module:id"`` imports ``module`` first, from the current folder too); or any
+            DMControl ``"domain-task"``, e.g. ``"cheetah-run"``.
         goal (str, optional): ``"fixed"`` or ``"random"``. ``None`` (default) is the fixed goal for
-            a short name, and whatever the id says for an environment id.
+            a short name, and for an id what ``Fixed`` or ``Random`` in it says.
 
     Returns:
-        Task: the task, with ``goal`` filled in.
+        Task: the task, with ``goal`` filled in where it is known.
 
     Raises:
         ValueError: for an unknown name (with the nearest known ones), or a goal that the task does
@@ -189,16 +209,16 @@ myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
     elif _in_dm_control(name):
         task = Task(name, name, suite="dm_control", solved=False, goal=goal or "fixed")
     elif _registered(name):
-        steps = gym.spec(name).max_episode_steps
-        task = Task(name, name, episode_steps=steps, goal=goal or "fixed")
+        task = _by_its_spec(name, goal)
     else:
         nearest = _nearest(name)
         hint = f"the nearest known names are {', '.join(nearest)}" if nearest else "none is near it"
         raise ValueError(
             f"Unknown task {name!r}; {hint}. list_tasks() gives the paper's tasks; any "
-            "registered Gymnasium id and any DMControl 'domain-task' work too."
+            "registered Gymnasium id and any DMControl 'domain-task' work too, and "
+            "'module:id' imports the module that registers a task of your own."
         )
-    if task.goal == "random" and task.random_id is None:
+    if goal == "random" and "random" not in task.goals:
         both = ", ".join(t.name for t in _BY_NAME.values() if t.random_id)
         raise ValueError(
             f"{task.name} has no random goal; the tasks that have both goals are {both}."
@@ -237,12 +257,26 @@ def _in_dm_control(name: str) -> bool:
 
 
 def _registered(name: str) -> bool:
-    module, _, env_id = name.rpartition(":")
-    if module:
-        importlib.import_module(module)
+    env_id = import_own_task(name)
     if env_id not in gym.registry:
         register_myosuite()
     return env_id in gym.registry
+
+
+def _by_its_spec(name: str, goal: Goal | None) -> Task:
+    """A task of which only what Gymnasium's registry and the id say is known."""
+    env_id = name.rpartition(":")[2]
+    spec = gym.spec(env_id)
+    said = next((own for own in ("fixed", "random") if own.capitalize() in env_id), None)
+    if said is not None and goal not in (None, said):
+        raise ValueError(
+            f"{name} names its {said} goal itself, but goal={goal!r} was asked for; leave goal out."
+        )
+    task = Task(name, env_id, None, episode_steps=spec.max_episode_steps, goal=said or goal)
+    if not str(spec.entry_point).startswith("myosuite."):
+        return task
+    once = _SOLVED_ONCE.match(env_id) is not None
+    return replace(task, suite="myosuite", solved_steps=1 if once else _MYOSUITE_STEPS)
 
 
 def _nearest(name: str, count: int = 5) -> list[str]:

@@ -35,6 +35,18 @@ from torchrl_etl.training.stage import Stage
 __all__ = ["ETL", "Explorer", "FineTuning"]
 
 FineTuning = Literal["critic", "reconstruction", "frozen"]
+MOST_SYNERGIES = 8
+"""d of bodies with at least twice as many actuators, among them all of the paper's tasks."""
+
+
+def default_num_synergies(actuators: int) -> int:
+    """d for a body: half of its actuators, between 1 and 8.
+
+    Examples:
+        >>> [default_num_synergies(n) for n in (1, 6, 21, 80)]
+        [1, 3, 8, 8]
+    """
+    return min(MOST_SYNERGIES, max(1, actuators // 2))
 
 
 class Explorer:
@@ -156,10 +168,22 @@ class ETL(Method):
             config.num_synergies = info.num_synergies
             space = context.spec
             check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
-        if config.num_synergies > context.spec.action_dim:
+        self._settle_num_synergies()
+
+    def _settle_num_synergies(self) -> None:
+        """Without a number, take one for the body; refuse more synergies than actuators."""
+        config, actuators = self.context.config, self.context.spec.action_dim
+        if config.num_synergies is None:
+            config.num_synergies = default_num_synergies(actuators)
+            if config.num_synergies < MOST_SYNERGIES:
+                self.context.say(
+                    f"num_synergies is {config.num_synergies}, as {config.env} has {actuators} "
+                    "actuators."
+                )
+        elif config.num_synergies > actuators:
             raise ValueError(
-                f"num_synergies is {config.num_synergies} but {config.env} has "
-                f"{context.spec.action_dim} actuators; choose at most that many."
+                f"num_synergies is {config.num_synergies} but {config.env} has {actuators} "
+                "actuators; choose at most that many, or null for a number that fits."
             )
 
     def check(self) -> None:

@@ -96,7 +96,7 @@ def validate(config: DictConfig) -> None:
         )
     if config.compile is not None:
         check_flag(compile=config.compile)
-    for name in ("frames", "threads"):
+    for name in ("frames", "threads", "num_synergies"):
         if config[name] is not None:
             check_integer(1, **{name: config[name]})
     check_integer(0, seed=config.seed, restart_seed=config.restart_seed)
@@ -105,7 +105,6 @@ def validate(config: DictConfig) -> None:
         raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
     check_integer(
         1,
-        num_synergies=config.num_synergies,
         action_repeat=config.action_repeat,
         log_every=config.log_every,
         **{

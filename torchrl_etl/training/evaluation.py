@@ -16,20 +16,19 @@ __all__ = ["EVALUATION_SEED", "Evaluation", "evaluate"]
 EVALUATION_SEED = 10_000_000
 """Seed of the first evaluation episode; training seeds start at 2**30."""
 
-SOLVED_STEPS = 5
-"""An episode counts as solved if it was so on more than this many steps, as MyoSuite counts."""
-
 
 class Evaluation(NamedTuple):
     """Episodes of one policy: undiscounted returns [E], lengths [E], solved steps [E] or None.
 
-    ``time_limit`` is the length of a full episode.
+    ``time_limit`` is the length of a full episode; ``successes`` [E] says which of them count as
+    solved, or is None.
     """
 
     returns: list[float]
     lengths: list[int]
     solved_steps: list[int] | None
     time_limit: int
+    successes: list[bool] | None
 
     @property
     def mean_return(self) -> Interval:
@@ -37,14 +36,12 @@ class Evaluation(NamedTuple):
 
     @property
     def solved(self) -> Interval | None:
-        """Share of episodes that MyoSuite counts as solved.
+        """Share of episodes that count as solved.
 
         On its walking tasks a step is "solved" while the speed is near the target, as it also is
         in falling forward; read :attr:`solved_time` there.
         """
-        if self.solved_steps is None:
-            return None
-        return success_interval([steps > SOLVED_STEPS for steps in self.solved_steps])
+        return None if self.successes is None else success_interval(self.successes)
 
     @property
     def solved_time(self) -> Interval | None:
@@ -75,6 +72,7 @@ def evaluate(
     episodes: int,
     max_steps: int = 1000,
     action_repeat: int = 1,
+    solved_steps: int | None = None,
     seed: int = EVALUATION_SEED,
 ) -> Evaluation:
     """Run the deterministic policy for one episode per evaluation seed.
@@ -90,12 +88,14 @@ def evaluate(
         max_steps (int): where to cut an episode that the environment does not end, in simulator
             steps, as are the lengths.
         action_repeat (int): simulator steps that a step of the environment takes.
+        solved_steps (int, optional): on how many steps an episode must be solved to count, such as
+            :attr:`Task.solved_steps <torchrl_etl.envs.Task>`. Default: on its last.
         seed (int): first seed.
 
     Returns:
         Evaluation: solved is None where the environment does not define it.
     """
-    returns, lengths, solved = [], [], []
+    returns, lengths, solved, successes = [], [], [], []
     devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
     with (
         torch.random.fork_rng(devices),
@@ -109,5 +109,8 @@ def evaluate(
             returns.append(rollout["next", "reward"].sum().item())
             lengths.append(min(max_steps, action_repeat * rollout.shape[-1]))
             if "solved" in rollout["next"].keys():
-                solved.append(action_repeat * rollout["next", "solved"].sum().item())
-    return Evaluation(returns, lengths, solved or None, max_steps)
+                flags = rollout["next", "solved"].flatten()
+                solved.append(action_repeat * flags.sum().item())
+                enough = solved_steps is not None and solved[-1] >= solved_steps
+                successes.append(flags[-1].item() if solved_steps is None else enough)
+    return Evaluation(returns, lengths, solved or None, max_steps, successes or None)

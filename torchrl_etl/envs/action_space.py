@@ -1,0 +1,75 @@
+"""Which action spaces synergies can be found in."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+__all__ = ["FlatAction", "check_action_space"]
+
+_LARGEST_BOUND = 1e6
+"""Bounds beyond are no bounds: MuJoCo and DMControl write 1e10 for a motor without limits."""
+
+
+class FlatAction(gym.ActionWrapper):
+    """Takes an action of any shape as one flat array of actuators."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        box = env.action_space
+        self.action_space = spaces.Box(box.low.ravel(), box.high.ravel(), dtype=box.dtype.type)
+        self._shape = box.shape
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        return np.reshape(action, self._shape)
+
+
+def check_action_space(space: spaces.Space, task: str) -> None:
+    """Refuses actions in which no synergy can be learned.
+
+    Args:
+        space (gymnasium.spaces.Space): of the actions, any shape.
+        task (str): its name, for the message.
+
+    Raises:
+        ValueError: unless the space is a box of real numbers, with bounds below 1e6 in magnitude
+            and some room between them for every actuator.
+    """
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+        raise ValueError(
+            f"{task} has the action space {space}; a synergy is a direction among "
+            "continuous actuators, so choose a task whose actions are a Box of real numbers."
+        )
+    low, high = space.low.ravel(), space.high.ravel()
+    if low.size == 0:
+        raise ValueError(f"{task} has no actuators; choose a task with at least one.")
+    largest = np.maximum(np.abs(low), np.abs(high))
+    _refuse(
+        ~(largest <= _LARGEST_BOUND),
+        task,
+        "no bounds",
+        low,
+        high,
+        "policies act between finite bounds, so register the task with "
+        "gymnasium.wrappers.RescaleAction or another wrapper that declares some",
+    )
+    _refuse(
+        ~(low < high),
+        task,
+        "no room between its bounds",
+        low,
+        high,
+        "leave it out of the action with a wrapper, or widen its bounds",
+    )
+
+
+def _refuse(
+    bad: np.ndarray, task: str, fault: str, low: np.ndarray, high: np.ndarray, cure: str
+) -> None:
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise ValueError(
+            f"{task}: actuator {first} of {bad.size} has {fault} "
+            f"([{low[first]:g}, {high[first]:g}]); {cure}."
+        )
