@@ -334,7 +334,7 @@ def test_the_decoder_loss_of_its_own_actions_is_zero() -> None:
 def test_the_learn_stage_learns_through_it(blend: float) -> None:
     decoder = overactuated_decoder(blend)
     overrides = ("run_dir=unused", "learn.decoder.fine_tuning=frozen")
-    stage = Experiment(tiny(*overrides)).learn_stage(decoder)
+    stage = Experiment(tiny(*overrides)).method.learn_stage(decoder)
     stage.restart_collection()
     try:
         for _ in range(4):

@@ -20,6 +20,8 @@ from tests.configs import ROOT, TINY, tiny
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
+from torchrl_etl.methods import etl
+from torchrl_etl.methods.etl import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
@@ -172,8 +174,9 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
 def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatch):
     run = tmp_path / "run"
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
-    stage = experiment.explore_stage()
-    monkeypatch.setattr(experiment, "explore_stage", lambda: stage)
+    explorer = Explorer(experiment.context)
+    stage = explorer.stage
+    monkeypatch.setattr(etl, "Explorer", lambda context: explorer)
     collect = stage.collect
 
     def collect_and_signal():
@@ -275,7 +278,7 @@ def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_pa
     update, updates = SACLearner.update, []
 
     def update_and_signal(self, batch):
-        updates.append(update(self))
+        updates.append(update(self, batch))
         if len(updates) == 20:
             os.kill(os.getpid(), signal.SIGINT)
         return updates[-1]
@@ -320,8 +323,8 @@ def test_learner_state_is_bit_exact_after_a_load(name, compile, tmp_path):
 
     def fresh():
         if name == "explore":
-            return experiment.explore_stage()
-        return experiment.learn_stage(SynergyDecoder(2, 16, hidden=(32, 32)))
+            return Explorer(experiment.context).stage
+        return experiment.method.learn_stage(SynergyDecoder(2, 16, hidden=(32, 32)))
 
     stage = fresh()
     stage.restart_collection()

@@ -40,10 +40,10 @@ def test_a_negative_number_of_frames_is_refused():
 def test_a_stage_begins_with_uniform_synergies_and_then_follows_its_policy():
     stage = learn_stage(None, "learn.init_random_frames=64")
     with torch.no_grad():  # a policy that emits the upper bound
-        for parameter in stage.actor.parameters():
+        for parameter in stage.learner.actor.parameters():
             parameter.zero_()
-        head = [m for m in stage.actor.modules() if isinstance(m, torch.nn.Linear)][-1]
-        head.bias[: stage.action_spec.shape[-1]] = 50.0
+        head = [m for m in stage.learner.actor.modules() if isinstance(m, torch.nn.Linear)][-1]
+        head.bias[: stage.learner.decoder.synergy_dim] = 50.0
     batches = [stage.collect()["synergy"] for _ in range(3)]
     assert all(batch.abs().median() < 0.9 for batch in batches[:2])
     assert (batches[2] > 0.9).all()
@@ -54,10 +54,11 @@ def test_a_resumed_stage_does_not_warm_up_again():
     stage = learn_stage(None, "learn.init_random_frames=64")
     stage.progress.frames = 64
     stage.restart_collection()
-    assert stage.warmup.seen == stage.warmup.frames == 64
+    warmup = next(m for m in stage.learner.behavior.modules() if isinstance(m, UniformWarmup))
+    assert warmup.seen == warmup.frames == 64
     stage.close()
 
 
 def test_workers_share_the_frames_of_a_run():
-    assert frames_per_action(collector={"kind": "async", "num_workers": 3}, action_repeat=2) == 6
-    assert frames_per_action(collector={"kind": "single", "num_workers": 3}, action_repeat=2) == 2
+    assert frames_per_action({"kind": "async", "num_workers": 3}, action_repeat=2) == 6
+    assert frames_per_action({"kind": "single", "num_workers": 3}, action_repeat=2) == 2
