@@ -17,12 +17,12 @@ from benchmarks.many_runs.group import EXPLORED, Group
 from benchmarks.many_runs.learner import Learner
 from benchmarks.many_runs.returns import ReturnScales
 from benchmarks.many_runs.settings import Settings, Shape
-from tests.configs import ROOT, tiny
+from tests.configs import RESIDUAL, ROOT, tiny
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.learners import entropy_target
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, LeanSACLoss, SynergySACLoss
 from torchrl_etl.training.evaluation import evaluate
-from torchrl_etl.training.stage import entropy_target, ready_for_training
 
 CPU = torch.device("cpu")
 SHAPE = Shape(actor=8, critic=16, batch_size=5, bins=11, most_steps=3, normalize_observations=False)
@@ -76,7 +76,7 @@ def test_losses_and_gradients_are_those_of_the_package(monkeypatch, synergies):
             loss = SynergySACLoss(actor, value, decoders[i], **kwargs)
         else:
             loss = LeanSACLoss(actor, value, **kwargs)
-        ready_for_training(loss, gamma=SETTINGS[i].gamma, tau=0.01)
+        loss.make_value_estimator(gamma=SETTINGS[i].gamma)
         cut = {name: batch[name][i] for name in ("observation", "following")}
         flat = TensorDict(
             {
@@ -156,11 +156,11 @@ def test_what_was_explored_is_given_as_in_the_recipe(tmp_path):
     experiment.run()
     run = {"seed": 0, "synergies": tmp_path / "run" / "synergies"}
     shape = {"actor": 8, "critic": 8, "batch_size": 5}
-    muscles = experiment.spec.full_action_spec_unbatched["action"].shape[-1]
-    sees = experiment.spec.observation_spec["observation"].shape[-1]
+    muscles = experiment.context.spec.action_dim
+    sees = experiment.context.spec.observation_dim
     described = {"reuse": True, "shape": shape, "runs": [run]}
     group = Group(described, slice(0, 1), [sees], muscles, 40, CPU)
-    stage = experiment.learn_stage(experiment._decoder()[0])
+    stage = experiment.method.stage()
     stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
     rows = stage.buffer.storage[:600].flatten_keys(".")
     for name, key in EXPLORED.items():
@@ -168,7 +168,7 @@ def test_what_was_explored_is_given_as_in_the_recipe(tmp_path):
     assert group.owed == group.learner.size == 600
     seen = torch.rand(1, sees)
     norm = RunningNorm(sees)
-    norm.see(rows["observation"])  # as LearnStage does with normalized observations
+    norm.see(rows["observation"])  # as Stage.prefill does with normalized observations
     torch.testing.assert_close(group.learner.norm(seen), norm(seen))
     group.update()
     assert group.owed == 0 and group.learner.updates == 601
@@ -211,9 +211,9 @@ def test_a_run_begins_where_the_recipe_begins_and_ends_in_a_table(tmp_path):
     assert set(table["status"]) == {"finished"} and set(table["commit"]) == {"abc"}
     assert table["return"].notna().all()
     for goal, row in zip(("fixed", "random"), table.itertuples(), strict=False):
-        options = ("learner=residual", "method=sac", "seed=3", f"goal={goal}", "run_dir=unused")
-        experiment = Experiment(tiny(*options, "actor.hidden=[64,64]"))
-        policy = experiment.learn_stage(None).acting()["actor"]
-        env = experiment.make_env()
+        options = ("method=sac", "seed=3", f"goal={goal}", "run_dir=unused", *RESIDUAL)
+        experiment = Experiment(tiny(*options, "actor.hidden=[64,64]", "critic.hidden=[96,96]"))
+        policy = experiment.method.stage().learner.policy
+        env = experiment.context.make_env()
         expected = evaluate(policy, env, episodes=row.episodes, max_steps=25)
         assert row[6] == pytest.approx(expected.mean_return.mean, rel=1e-4)

@@ -34,12 +34,12 @@ import torch
 from torchrl_etl.analysis.bench_results import COLUMNS
 from torchrl_etl.collectors.seeds import training_seed
 from torchrl_etl.envs import resolve_task
-from torchrl_etl.training.evaluation import SOLVED_STEPS
 from torchrl_etl.training.run_folder import facts
 
 from .group import Group
 from .simulators import Simulators, Task, sizes
 
+SOLVED_STEPS = 6  # of an episode that counts as solved, as MyoSuite counts
 EPISODES = {"fixed": 1, "random": 5}  # of an evaluation; all that have a fixed goal are the same
 
 
@@ -168,7 +168,7 @@ class ManyRuns:
                     **{key: run[key] for key in ("task", "goal", "method", "seed")},
                     "frames": frames + run.get("charged", 0),
                     "return": returns[i, tried].mean(),
-                    "solved": (solved[i, tried] > SOLVED_STEPS).mean(),
+                    "solved": (solved[i, tried] >= SOLVED_STEPS).mean(),
                     "solved_time": (solved[i, tried] / self.limits[i]).mean(),
                     "episodes": self.episodes[i],
                     "wall_seconds": seconds,

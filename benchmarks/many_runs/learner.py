@@ -21,9 +21,9 @@ from torchrl_etl.functional import (
     tanh_sum,
     tanh_sum_log_slope,
 )
+from torchrl_etl.learners import entropy_target
 from torchrl_etl.modules import RunningNorm, SynergyDecoder
 from torchrl_etl.modules.synergy_decoder import INSIDE
-from torchrl_etl.training.stage import entropy_target
 
 from .initial import initial_weights
 from .networks import BatchNormBody, Mlp, ResidualBody, Stack

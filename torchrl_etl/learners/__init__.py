@@ -3,6 +3,15 @@
 from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.sac import SACLearner, entropy_target
+from torchrl_etl.learners.side_by_side import SideBySide
 from torchrl_etl.learners.term import Term
 
-__all__ = ["NORMALIZED", "Objective", "SACLearner", "Term", "build_learner", "entropy_target"]
+__all__ = [
+    "NORMALIZED",
+    "Objective",
+    "SACLearner",
+    "SideBySide",
+    "Term",
+    "build_learner",
+    "entropy_target",
+]

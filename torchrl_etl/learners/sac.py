@@ -135,6 +135,7 @@ class SACLearner:
             sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
         self.objective = Objective(
             sac,
+            actor,
             terms,
             normalizer=normalizer,
             return_scale=None if return_bound is None else ReturnScale(gamma, bound=return_bound),
@@ -166,13 +167,17 @@ class SACLearner:
     def step(self, batch: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
         gradients, scalars = self._gradients(batch)
+        self.descend(gradients)
+        return scalars
+
+    def descend(self, gradients: Sequence[Tensor | None]) -> None:
+        """A step of the optimizer along gradients in the order of ``parameters``."""
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         self.optimizer.step()
         normalize_rows(self.unit_rows)
         for target in self.targets:
             target.step()
-        return scalars
 
     def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         """Gradients of the objective, in the order of ``parameters``, and scalars to log."""

@@ -1,0 +1,97 @@
+"""Learners updated side by side end where each would have ended by itself."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.configs import RESIDUAL
+from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
+from torchrl_etl.learners import SideBySide
+
+SEEDS = (0, 1, 2)
+MAKERS = {
+    "sac": lambda *settings: method_stage("sac", *settings),
+    "stage 2": lambda *settings: learn_stage(None, *settings),
+    "stage 2, categorical": lambda *settings: learn_stage(
+        None, *RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]", *settings
+    ),
+    "stage 1": lambda *settings: explorer(*settings).stage,
+    "stage 1, METRA": lambda *settings: explorer("exploration=metra", *settings).stage,
+}
+
+
+@pytest.fixture
+def still(monkeypatch):
+    """Noise is zero and pairs are not shuffled, so that numbers can be compared one by one."""
+    monkeypatch.setattr(torch, "randn_like", torch.zeros_like)
+    monkeypatch.setattr(torch, "randperm", lambda n, **options: torch.arange(n))
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_gradients_of_stacked_learners_are_those_of_each(make, still):
+    stages = [make(f"seed={seed}") for seed in SEEDS]
+    for stage in stages:
+        fill(stage)
+        stage.close()
+    batches = [stage.buffer.sample() for stage in stages]
+    alone = [stage.learner.gradients(batch) for stage, batch in zip(stages, batches, strict=True)]
+    together, scalars = SideBySide([stage.learner for stage in stages]).gradients(
+        torch.stack(batches)
+    )
+    for (expected, logged), found, log in zip(alone, together, scalars.unbind(0), strict=True):
+        assert len(found) == len(expected)
+        for one, other in zip(expected, found, strict=True):
+            assert (one is None or not one.any()) if other is None else True
+            if one is not None and other is not None:
+                torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
+        for key, value in logged.items():
+            torch.testing.assert_close(log[key], value, rtol=1e-3, atol=1e-5)
+
+
+def test_an_update_moves_each_learner_by_its_own_batch(still):
+    ours = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
+    theirs = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
+    for one, other in zip(ours, theirs, strict=True):
+        fill(one)
+        other.learner.objective.load_state_dict(one.learner.objective.state_dict())
+        other.learner.ema.load_state_dict(one.learner.ema.state_dict())
+    for stage in (*ours, *theirs):  # Adam's first steps make a sign of rounding
+        stage.learner.optimizer = torch.optim.SGD(stage.learner.parameters, lr=1e-2)
+    starts = [snapshot(stage.learner.ema) for stage in theirs]
+    side_by_side = SideBySide([stage.learner for stage in ours])
+    for _ in range(3):
+        batches = [stage.buffer.sample() for stage in ours]
+        side_by_side.update(batches)
+        for stage, batch in zip(theirs, batches, strict=True):
+            stage.learner.update(batch)
+    for one, other, start in zip(ours, theirs, starts, strict=True):
+        moved = apart = 0.0
+        for key, value in other.learner.ema.state_dict().items():
+            moved += (value - start[key]).abs().sum().item()
+            apart += (value - one.learner.ema.state_dict()[key]).abs().sum().item()
+        assert moved > 0 and apart < 1e-3 * moved
+        one.close(), other.close()
+
+
+def test_noise_differs_from_learner_to_learner():
+    stages = [learn_stage(None, "seed=0") for _ in range(2)]
+    fill(stages[0])
+    batch = stages[0].buffer.sample()
+    state = stages[0].learner.objective.state_dict()
+    stages[1].learner.objective.load_state_dict(state)
+    _, scalars = SideBySide([stage.learner for stage in stages]).gradients(
+        torch.stack([batch, batch])
+    )
+    assert scalars["loss_actor"][0] != scalars["loss_actor"][1]
+    for stage in stages:
+        stage.close()
+
+
+def test_learners_of_other_sizes_are_refused():
+    small, large = (learn_stage(None, f"actor.hidden=[{width}]") for width in (8, 16))
+    with pytest.raises(ValueError, match=r"learners\[1\] has parameters of other shapes"):
+        SideBySide([small.learner, large.learner])
+    with pytest.raises(ValueError, match="learners is empty"):
+        SideBySide([])
+    small.close(), large.close()
