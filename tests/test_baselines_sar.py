@@ -339,11 +339,13 @@ def test_the_learn_stage_learns_through_it(blend: float) -> None:
     try:
         for _ in range(4):
             batch = stage.collect()
-        actor = {key: value.clone() for key, value in stage.actor.state_dict().items()}
+        actor = {key: value.clone() for key, value in stage.learner.actor.state_dict().items()}
         fixed = {key: value.clone() for key, value in decoder.state_dict().items()}
         torch.testing.assert_close(batch["action"], decode(decoder, batch["synergy"]))
         assert stage.update()["loss_decoder"] < 1e-10
-        assert any(not torch.equal(v, actor[k]) for k, v in stage.actor.state_dict().items())
+        assert any(
+            not torch.equal(v, actor[k]) for k, v in stage.learner.actor.state_dict().items()
+        )
         assert all(torch.equal(v, fixed[k]) for k, v in decoder.state_dict().items())
     finally:
         stage.close()

@@ -28,7 +28,8 @@ def fitted_decoder(seed=0, **kwargs):
     torch.manual_seed(seed)
     low, high = [0.0, -1.0, 0.0, 0.1, 0.0], [1.0, 1.0, 2.0, 0.7, 1.0]
     gmvae = GMVAE(5, 2, num_components=3, low=low, high=high, hidden=(8, 16))
-    return SynergyDecoder.from_gmvae(gmvae, torch.rand(64, 5), **kwargs)
+    inside = gmvae.low + (gmvae.high - gmvae.low) * torch.rand(64, 5)
+    return SynergyDecoder.from_gmvae(gmvae, inside, **kwargs)
 
 
 def save(decoder, path, **facts):
