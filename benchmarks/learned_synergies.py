@@ -15,23 +15,18 @@ import json
 from pathlib import Path
 
 import torch
-from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_etl.analysis import pca_vaf, variance_accounted_for
+from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.command_line import quiet_torchrl
-from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
-from torchrl_etl.synergies import fit_gmvae
+from torchrl_etl.synergies import fit_synergies, save_bundle
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
 
 EPISODES = 50
 UPDATES = 4000
-# Where the bounds are ±1: as far as a muscle counts as inside of them.
-NEAREST = 0.99
+HIDDEN = (128, 128)
 
 
 def main() -> None:
@@ -63,20 +58,12 @@ def main() -> None:
                 actions.append(stage.learner.policy(rollout.select("observation"))["action"])
     shown = torch.cat(actions)
 
-    if arguments.model == "pca":
-        decoder = principal_directions(shown, arguments.num_synergies, experiment.context.spec)
-        vaf, components = pca_vaf(shown, arguments.num_synergies), None
-    else:
-        gmvae = GMVAE.from_spec(
-            experiment.context.spec.action_spec,
-            arguments.num_synergies,
-            num_components=arguments.num_synergies,
-            hidden=config.synergies.hidden,
-        )
-        fit_gmvae(gmvae, shown, updates=UPDATES)
-        decoder = SynergyDecoder.from_gmvae(gmvae, shown)
-        vaf = variance_accounted_for(shown, gmvae.reconstruct(shown).detach())
-        components = gmvae.num_components
+    space = experiment.context.spec
+    options = {} if arguments.model == "pca" else {"updates": UPDATES, "hidden": HIDDEN}
+    bounds = {"low": space.low, "high": space.high}
+    model = fit_synergies(shown, arguments.model, arguments.num_synergies, **bounds, **options)
+    with torch.no_grad():
+        vaf = variance_accounted_for(shown, model.reconstruct(shown))
     known = {
         "vaf": vaf,
         "model": arguments.model,
@@ -85,34 +72,14 @@ def main() -> None:
         **facts(),
     }
     save_bundle(
-        decoder,
+        model.decoder(shown),
         arguments.out,
         task=experiment.task.env_id,
         actuators=experiment.context.spec.actuators,
-        num_components=components,
+        num_components=model.num_components,
         facts=known,
     )
     print(json.dumps(known))
-
-
-def principal_directions(
-    actions: Tensor, num_synergies: int, spec: EnvironmentSpec
-) -> SynergyDecoder:
-    """The mean action, and the directions in which actions vary most, before the bounds.
-
-    As with a GMVAE the box of coefficients spans the 1st to the 99th percentile of each.
-    """
-    space = spec.action_spec.space
-    middle, half = (space.high + space.low) / 2, (space.high - space.low) / 2
-    inner = ((actions - middle) / half).clamp(-NEAREST, NEAREST).atanh()
-    center = inner.mean(0)
-    basis = torch.linalg.svd(inner - center, full_matrices=False).Vh[:num_synergies]
-    ends = ((inner - center) @ basis.mT).quantile(torch.tensor([0.01, 0.99]), dim=0)
-    unit = (center + ends.mean(0) @ basis).tanh()
-    directions = (ends[1] - ends[0])[:, None] / 2 * basis * (1 - unit.square())
-    return SynergyDecoder.from_directions(
-        middle + half * unit, half * directions, low=space.low, high=space.high
-    )
 
 
 if __name__ == "__main__":

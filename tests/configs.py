@@ -42,5 +42,7 @@ RESIDUAL = (
 
 def tiny(*overrides: str, name: str = "config") -> DictConfig:
     """The tiny configuration with overrides."""
+    of_networks = {"synergies=pca", "synergies=nmf"}.isdisjoint(overrides)
+    small = [key for key in TINY if of_networks or not key.startswith("synergies.")]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, overrides=[*TINY, *overrides])
+        return compose(name, overrides=[*small, *overrides])

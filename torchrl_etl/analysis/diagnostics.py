@@ -263,11 +263,17 @@ def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | Array
     return float(np.mean((place * way).sum(1) / np.maximum(lengths, 1e-12)))
 
 
+_CURE = "; ask for more synergies, or for those of another kind"
+_UNDERFITTED = ": it is underfitted, so train it longer or lower the weight of its KL terms"
+_CURES = {"gmvae": _UNDERFITTED, "vae": _UNDERFITTED}
+
+
 def synergy_warnings(
     *,
     vaf: float,
     pca_vaf: float,
     authority: Tensor | ArrayLike,
+    kind: str = "gmvae",
     usage: MixtureUsage | None = None,
     min_vaf: float = 0.5,
     pca_tolerance: float = 0.02,
@@ -277,13 +283,14 @@ def synergy_warnings(
     """Say in words what is wrong with a synergy space; an empty list means nothing was found.
 
     Keyword Args:
-        vaf (float): variance that the GMVAE accounts for.
+        vaf (float): variance that the synergy model accounts for.
         pca_vaf (float): variance that PCA accounts for with as many dimensions.
         authority (Tensor or array): what :func:`control_authority` returned [n].
+        kind (str): of the synergy model. Default: ``"gmvae"``.
         usage (MixtureUsage, optional): what :func:`mixture_usage` returned.
-        min_vaf (float): least acceptable share of the variance, by the GMVAE or by PCA.
+        min_vaf (float): least acceptable share of the variance, by the model or by PCA.
             Default: 0.5.
-        pca_tolerance (float): how far the GMVAE may stay behind PCA. Default: 0.02.
+        pca_tolerance (float): how far the model may stay behind PCA. Default: 0.02.
         min_authority (float): lowest acceptable mean authority. Default: 0.2.
         min_components (float): lowest acceptable effective number of components. Default: 1.5.
 
@@ -297,12 +304,12 @@ def synergy_warnings(
         ...     print(line)
         The synergies move an actuator over 5% of its range on average (20% is the least
         advised; 1 of 2 actuators move less than 1%): learn on them only with a residual, or fit
-        the GMVAE longer, on actions that vary more.
+        them to actions that vary more.
     """
-    found = []
+    found, name = [], kind.upper()
     if max(vaf, pca_vaf) < min_vaf:
         found.append(
-            f"The actions hardly have synergies: the GMVAE accounts for {vaf:.0%} of their "
+            f"The actions hardly have synergies: the {name} accounts for {vaf:.0%} of their "
             f"variance and PCA for {pca_vaf:.0%} ({min_vaf:.0%} is the least advised); fit on the "
             "policy's "
             "mean actions or on muscle activations instead of sampled actions, or raise the number "
@@ -310,9 +317,8 @@ def synergy_warnings(
         )
     if vaf < pca_vaf - pca_tolerance:
         found.append(
-            f"The GMVAE accounts for {vaf:.1%} of the actions' variance, less than PCA's "
-            f"{pca_vaf:.1%} with as many dimensions: it is underfitted, so train it longer or "
-            "lower the weight of its KL terms."
+            f"The {name} accounts for {vaf:.1%} of the actions' variance, less than PCA's "
+            f"{pca_vaf:.1%} with as many dimensions{_CURES.get(kind, _CURE)}."
         )
     authority = _array(authority)
     if authority.mean() < min_authority:
@@ -321,7 +327,7 @@ def synergy_warnings(
         found.append(
             f"The synergies move an actuator over {authority.mean():.0%} of its range on average "
             f"({min_authority:.0%} is the least advised{idle}): learn on them only with a "
-            "residual, or fit the GMVAE longer, on actions that vary more."
+            "residual, or fit them to actions that vary more."
         )
     if usage is not None and len(usage.shares) > 1 and usage.effective < min_components:
         found.append(

@@ -49,7 +49,9 @@ def describe_synergies(
     if isinstance(model, GMVAESynergies):
         usage = mixture_usage(model.model, actions)
         numbers["effective_components"] = usage.effective
-    return numbers, synergy_warnings(vaf=vaf, pca_vaf=pca, authority=authority, usage=usage)
+    return numbers, synergy_warnings(
+        vaf=vaf, pca_vaf=pca, authority=authority, kind=model.kind, usage=usage
+    )
 
 
 def draw_synergies(

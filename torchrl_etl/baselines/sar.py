@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.modules.recorded_actions import as_bounds
 from torchrl_etl.modules.synergy_decoder import SynergyMap
 
 __all__ = ["SARDecoder", "best_episodes"]
@@ -262,23 +263,8 @@ def _check_blend(blend: float) -> None:
 
 def _bounds(low: Any, high: Any, mean: Tensor) -> tuple[Tensor, Tensor]:
     """Both bounds as [n], in the dtype and on the device of ``mean``."""
-    bounds = []
-    for bound in (low, high):
-        bound = torch.as_tensor(bound).detach().to(mean)
-        if bound.shape not in ((), mean.shape):
-            raise ValueError(
-                f"An action bound has shape {list(bound.shape)} but there are {len(mean)} "
-                "actuators; pass one number, or one for each."
-            )
-        bounds.append(bound.expand(len(mean)).clone())
-    low, high = bounds
-    if not (low.isfinite() & high.isfinite() & (low < high)).all():
-        raise ValueError(
-            f"The action bounds are low={low.tolist()} and high={high.tolist()}; every lower bound "
-            "must be finite and below its upper bound. Take them from the environment's action "
-            "spec."
-        )
-    return low, high
+    low, high = as_bounds(low, high, len(mean))
+    return low.to(mean), high.to(mean)
 
 
 def _check_actions(actions: Tensor, num_synergies: int, low: Any, high: Any) -> None:

@@ -239,7 +239,7 @@ class ETL(Method):
             context.folder.synergies,
             task=resolve_task(context.config.env, context.config.goal).env_id,
             actuators=context.spec.actuators,
-            num_components=explorer.model.model.num_components,
+            num_components=explorer.model.num_components,
             facts={**numbers, "seed": context.config.seed, **facts()},
         )
 
@@ -247,10 +247,12 @@ class ETL(Method):
         from torchrl_etl.analysis import draw_synergies, embedding
 
         context, curve = self.context, self.context.options("vaf_curve")
-        folder, updates = context.folder.pictures, curve.pop("updates")
+        folder, updates = context.folder.pictures, {"updates": curve.pop("updates")}
+        if explorer.model.loss is None:  # it is fitted in one go
+            updates = {}
         try:
             draw_synergies(
-                lambda d: make_synergy_model(context, d, updates=updates),
+                lambda d: make_synergy_model(context, d, **updates),
                 decoder,
                 explorer.actions(),
                 context.spec.actuators,

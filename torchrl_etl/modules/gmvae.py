@@ -11,6 +11,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.modules.recorded_actions import as_bounds
 
 __all__ = ["GMVAE", "ActionDecoder", "Posterior"]
 
@@ -77,20 +78,7 @@ class ActionDecoder(nn.Module):
     ) -> None:
         super().__init__()
         check_positive(latent_dim=latent_dim, action_dim=action_dim)
-        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (low, high))
-        for bound in (low, high):
-            if bound.shape not in ((), (action_dim,)):
-                raise ValueError(
-                    f"An action bound has shape {tuple(bound.shape)} but there are {action_dim} "
-                    "actuators; pass one number, or one for each."
-                )
-        low, high = low.expand(action_dim).clone(), high.expand(action_dim).clone()
-        if not (torch.isfinite(low) & torch.isfinite(high) & (low < high)).all():
-            raise ValueError(
-                f"The action bounds are low={low.tolist()} and high={high.tolist()}; every lower "
-                "bound must be finite and below its upper bound. Take them from the environment's "
-                "action spec."
-            )
+        low, high = as_bounds(low, high, action_dim)
         self.latent_dim, self.action_dim, self.hidden = latent_dim, action_dim, tuple(hidden)
         self.mlp = MLP(latent_dim, action_dim, num_cells=list(hidden), activation_class=nn.ELU)
         self.register_buffer("low", low)

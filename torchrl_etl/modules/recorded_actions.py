@@ -1,4 +1,4 @@
-"""Arrays of recorded actions, as files and NumPy hold them, made fit for a GMVAE."""
+"""Arrays of recorded actions and their bounds, as files and NumPy hold them, made fit to use."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["as_actions"]
+__all__ = ["as_actions", "as_bounds"]
 
 # Recordings overshoot their bounds a little: filters ring, and estimates are noisy.
 OVERSHOOT = 0.1
@@ -82,6 +82,38 @@ def as_actions(
     return rows
 
 
+def as_bounds(low: Any, high: Any, action_dim: int) -> tuple[Tensor, Tensor]:
+    """Both action bounds as [n], in single precision, each a copy.
+
+    Args:
+        low, high (float, sequence of float or Tensor): one number, or one for each actuator.
+        action_dim (int): number n of actuators.
+
+    Raises:
+        ValueError: if a bound has another shape than [] or [n], or a lower bound is not finite and
+            below its upper bound.
+
+    Examples:
+        >>> as_bounds(0.0, [1.0, 2.0], 2)
+        (tensor([0., 0.]), tensor([1., 2.]))
+    """
+    low, high = (torch.as_tensor(bound, dtype=torch.float32).detach() for bound in (low, high))
+    for bound in (low, high):
+        if bound.shape not in ((), (action_dim,)):
+            raise ValueError(
+                f"An action bound has shape {tuple(bound.shape)} but there are {action_dim} "
+                "actuators; pass one number, or one for each."
+            )
+    low, high = low.expand(action_dim).clone(), high.expand(action_dim).clone()
+    if not (low.isfinite() & high.isfinite() & (low < high)).all():
+        raise ValueError(
+            f"The action bounds are low={low.tolist()} and high={high.tolist()}; every lower "
+            "bound must be finite and below its upper bound. Take them from the environment's "
+            "action spec."
+        )
+    return low, high
+
+
 def _check_values(rows: Tensor, low: Tensor, high: Tensor) -> None:
     broken = ~torch.isfinite(rows).all(-1)
     if broken.any():
@@ -93,6 +125,6 @@ def _check_values(rows: Tensor, low: Tensor, high: Tensor) -> None:
     if ((rows < low - margin) | (rows > high + margin)).any():
         raise ValueError(
             f"The actions lie between {rows.min():g} and {rows.max():g}, but the bounds are "
-            f"[{low.min():g}, {high.max():g}]; bring the actions to these units, or build the "
-            "GMVAE with low= and high= of theirs."
+            f"[{low.min():g}, {high.max():g}]; bring the actions to these units, or give "
+            "the model low= and high= of theirs."
         )

@@ -21,7 +21,22 @@ __all__ = ["SynergyDecoder", "SynergyMap"]
 
 # Where synergies alone end: in single precision a tanh reaches 1, whence no residual leads back.
 INSIDE = 1.0 - 1e-6
+# Where the bounds are ±1: as far as a recorded muscle counts as inside of them.
+NEAREST = 0.99
 _MOST_ROWS = 100_000
+
+
+def percentile_box(coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """Middle and half width [d] of the 1st to the 99th percentile of coefficients [N, d].
+
+    Examples:
+        >>> percentile_box(torch.linspace(0, 4, 101)[:, None])
+        (tensor([2.]), tensor([1.9600]))
+    """
+    # torch.quantile takes 16 million numbers at most.
+    rows = coefficients[:: 1 + len(coefficients) // _MOST_ROWS]
+    low, high = rows.quantile(rows.new_tensor([0.01, 0.99]), dim=0)
+    return (high + low) / 2, (high - low) / 2
 
 
 class _ScaledDecoder(nn.Module):
@@ -179,12 +194,13 @@ class SynergyDecoder(SynergyMap):
             if actions is None:
                 low = (gmvae.prior_loc - 2 * gmvae.prior_scale).amin(0)
                 high = (gmvae.prior_loc + 2 * gmvae.prior_scale).amax(0)
+                center, scale = (high + low) / 2, (high - low) / 2
             else:
-                # torch.quantile takes 16 million numbers at most.
-                latent = gmvae.infer(actions[:: 1 + len(actions) // _MOST_ROWS])
-                low, high = latent.quantile(latent.new_tensor([0.01, 0.99]), dim=0)
-            scaled.center.copy_((high + low) / 2)
-            scaled.scale.copy_(((high - low) / 2).clamp_min(1e-6))
+                center, scale = percentile_box(
+                    gmvae.infer(actions[:: 1 + len(actions) // _MOST_ROWS])
+                )
+            scaled.center.copy_(center)
+            scaled.scale.copy_(scale.clamp_min(1e-6))
         return decoder
 
     @classmethod

@@ -1,11 +1,26 @@
 """What condenses muscle actions into synergies, one kind a file."""
 
-from collections.abc import Callable, Mapping
-
+from torchrl_etl.modules.bundle import load_bundle, save_bundle
+from torchrl_etl.synergies.affine import AffineSynergies
+from torchrl_etl.synergies.fit import SYNERGY_MODELS, fit_synergies
 from torchrl_etl.synergies.gmvae import GMVAESynergies, fit_gmvae
 from torchrl_etl.synergies.model import SynergyModel
+from torchrl_etl.synergies.nmf import NMFSynergies
+from torchrl_etl.synergies.pca import PCASynergies
 from torchrl_etl.synergies.shown import ShownActions
+from torchrl_etl.synergies.vae import VAESynergies
 
-__all__ = ["SYNERGY_MODELS", "GMVAESynergies", "ShownActions", "SynergyModel", "fit_gmvae"]
-
-SYNERGY_MODELS: Mapping[str, Callable[..., SynergyModel]] = {"gmvae": GMVAESynergies}
+__all__ = [
+    "SYNERGY_MODELS",
+    "AffineSynergies",
+    "GMVAESynergies",
+    "NMFSynergies",
+    "PCASynergies",
+    "ShownActions",
+    "SynergyModel",
+    "VAESynergies",
+    "fit_gmvae",
+    "fit_synergies",
+    "load_bundle",
+    "save_bundle",
+]

@@ -60,6 +60,7 @@ class GMVAESynergies(SynergyModel):
             high=high.tolist(),
             hidden=hidden,
         ).to(low.device)
+        self.num_components = self.model.num_components
         self.loss = GMVAELoss(
             self.model, kl_weight=kl_weight, component_kl_weight=component_kl_weight
         )

@@ -1,0 +1,197 @@
+"""Every kind of synergies, against numbers that were put into the actions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.configs import tiny
+from tests.stages import explorer
+from torchrl_etl.analysis import describe_synergies, draw_synergies, variance_accounted_for
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.synergies import SYNERGY_MODELS, SynergyModel, fit_synergies, load_bundle
+
+AFFINE = ("pca", "nmf")
+FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden": (8,)}}
+
+
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    torch.manual_seed(0)
+
+
+def activity(rows: int = 400) -> Tensor:
+    """Of six muscles in [0, 1], from two sources that are never negative."""
+    return torch.rand(rows, 2) @ (torch.rand(2, 6) / 2)
+
+
+def fitted(kind: str, actions: Tensor) -> SynergyModel:
+    return fit_synergies(actions, kind, 2, low=0.0, high=1.0, **FEW.get(kind, {}))
+
+
+def linear(decoder: nn.Module) -> nn.Linear:
+    (layer,) = (module for module in decoder.modules() if isinstance(module, nn.Linear))
+    return layer
+
+
+def test_pca_finds_two_directions_before_the_bounds_with_their_ranges() -> None:
+    center, basis = torch.randn(16) / 4, torch.linalg.qr(torch.randn(16, 2)).Q.mT
+    coefficients = (2 * torch.rand(20_000, 2) - 1) * torch.tensor([1.2, 0.4])
+    actions = (center + coefficients @ basis).tanh()
+    layer = linear(fit_synergies(actions, "pca", 2).decoder(actions))
+    # Rows of 98 % of a uniform range: the larger first, each with either sign.
+    sizes = layer.weight.norm(dim=0)
+    torch.testing.assert_close(sizes, 0.98 * torch.tensor([1.2, 0.4]), rtol=0.02, atol=0)
+    overlap = (layer.weight.mT / sizes[:, None]) @ basis.mT
+    torch.testing.assert_close(overlap.abs(), torch.eye(2), rtol=0, atol=0.02)
+    torch.testing.assert_close(layer.bias, center, rtol=0, atol=0.02)
+
+
+def test_pca_of_a_known_covariance_keeps_its_larger_variance() -> None:
+    """Rows ±(3, 3) and ±(1, -1), over ten: variances 9 : 1 along the diagonals."""
+    before = torch.tensor([[3.0, 3.0], [-3.0, -3.0], [1.0, -1.0], [-1.0, 1.0]]) / 10
+    model = fit_synergies(before.tanh(), "pca", 1)
+    torch.testing.assert_close(model.basis.abs(), torch.full((1, 2), 0.5**0.5))
+    torch.testing.assert_close(model.mean, torch.zeros(2))
+    kept = torch.tensor([[3.0, 3.0], [-3.0, -3.0], [0.0, 0.0], [0.0, 0.0]]) / 10
+    torch.testing.assert_close(model.reconstruct(before.tanh()), kept.tanh(), atol=1e-6, rtol=0)
+
+
+def test_muscles_at_their_bounds_leave_the_decoder_finite() -> None:
+    actions = torch.ones(100, 16)
+    actions[::2] = -1.0
+    decoder = fit_synergies(actions, "pca", 1).decoder(actions)
+    ends = decoder.module(torch.tensor([[-1.0], [1.0]]))
+    assert ends.isfinite().all()
+    torch.testing.assert_close(ends.abs(), torch.full((2, 16), 0.99), atol=1e-4, rtol=0)
+
+
+def test_nmf_finds_the_factors_that_were_planted() -> None:
+    """Each source alone in some rows, and a muscle of its own: the factorization is unique."""
+    parts = torch.tensor([[0.8, 0.0, 0.4, 0.2], [0.0, 0.6, 0.3, 0.9]])
+    weights = torch.rand(600, 2) / 2
+    weights[:100, 0] = 0.0
+    weights[100:200, 1] = 0.0
+    low = torch.tensor([-1.0, 0.0, 2.0, -1.0])
+    actions = low + weights @ parts
+    model = fit_synergies(actions, "nmf", 2, low=low, high=low + 2)
+    assert (model.basis >= 0).all()
+    found = nn.functional.normalize(model.basis, dim=-1)
+    found = found[found[:, 0].argsort(descending=True)]
+    torch.testing.assert_close(found, nn.functional.normalize(parts, dim=-1), atol=0.02, rtol=0)
+    assert variance_accounted_for(actions, model.reconstruct(actions)) > 0.999
+
+
+def test_nmf_decodes_with_the_slope_of_its_factors_in_the_middle_of_the_box() -> None:
+    actions = activity()
+    model = fitted("nmf", actions)
+    decoder = model.decoder(actions)
+    share = torch.tensor([0.01, 0.99])
+    ends = model.coefficients(actions).quantile(share, dim=0)
+    at = torch.zeros(2)
+    torch.testing.assert_close(decoder.module(at), ends.mean(0) @ model.basis)
+    slope = torch.autograd.functional.jacobian(decoder.module, at)
+    torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
+
+
+def test_a_muscle_that_rests_stays_at_rest_in_nmf() -> None:
+    actions = activity()
+    actions[:, 3] = 0.0
+    decoder = fitted("nmf", actions).decoder(actions)
+    moved = decoder.module(2 * torch.rand(200, 2) - 1)
+    assert moved[:, 3].max() < 0.01
+    assert moved.isfinite().all()
+
+
+def test_a_vae_is_a_gmvae_of_one_component_to_the_bit() -> None:
+    actions = activity()
+    torch.manual_seed(1)
+    one = fitted("vae", actions)
+    torch.manual_seed(1)
+    other = fit_synergies(actions, "gmvae", 2, low=0.0, high=1.0, num_components=1, **FEW["gmvae"])
+    assert one.num_components == 1
+    assert torch.equal(one.reconstruct(actions), other.reconstruct(actions))
+
+
+@pytest.mark.parametrize("kind", SYNERGY_MODELS)
+def test_arrays_of_any_kind_are_taken_and_bad_ones_are_refused_in_a_sentence(kind: str) -> None:
+    actions = activity().double().numpy()
+    decoder = fitted(kind, actions).decoder(actions)
+    assert decoder.low.tolist() == [0.0] * 6 and decoder.num_synergies == 2
+    fitted(kind, actions.tolist())
+    actions[3, 1] = np.nan
+    with pytest.raises(ValueError, match="NaN or infinity in 1 of 400 rows, the first in row 3"):
+        fitted(kind, actions)
+    with pytest.raises(ValueError, match="bring the actions to these units"):
+        fitted(kind, activity() + 9)
+    with pytest.raises(ValueError, match=r"only 6 actuators; choose at most 6"):
+        fit_synergies(activity(), kind, 7, low=0.0, high=1.0)
+    with pytest.raises(ValueError, match=r"shape \(3,\) but there are 6 actuators"):
+        fit_synergies(activity(), kind, 2, low=[0.0] * 3, high=1.0)
+
+
+def test_an_unknown_kind_is_refused_with_the_nearest() -> None:
+    with pytest.raises(ValueError, match="nmf"):
+        fit_synergies(activity(), "nfm")
+
+
+@pytest.mark.parametrize("kind", AFFINE)
+def test_synergies_are_asked_for_before_they_are_fitted_is_said(kind: str) -> None:
+    model = SYNERGY_MODELS[kind](torch.zeros(6), torch.ones(6), 2)
+    for use in (model.decoder, model.reconstruct):
+        with pytest.raises(RuntimeError, match=rf"The {kind} has no synergies yet; call fit"):
+            use(activity())
+
+
+@pytest.mark.parametrize("kind", AFFINE)
+@pytest.mark.filterwarnings("ignore:The 50 actions are all alike")
+def test_actions_all_alike_give_a_finite_decoder(kind: str) -> None:
+    for value in (0.0, 0.3):
+        actions = torch.full((50, 6), value)
+        decoder = fitted(kind, actions).decoder(actions)
+        assert decoder.module(torch.ones(2)).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", SYNERGY_MODELS)
+def test_every_kind_is_described_and_drawn_under_its_name(kind: str, tmp_path) -> None:
+    actions = activity()
+    numbers, warnings = describe_synergies(
+        model := fitted(kind, actions), model.decoder(actions), actions
+    )
+    assert {"vaf", "pca_vaf", "nmf_vaf", "control_authority"} <= set(numbers)
+    assert not any("GMVAE" in words for words in warnings) or kind == "gmvae"
+    bounds = torch.zeros(6), torch.ones(6)
+    draw_synergies(
+        lambda d: SYNERGY_MODELS[kind](*bounds, d, **FEW.get(kind, {})),
+        model.decoder(actions),
+        actions,
+        list("abcdef"),
+        tmp_path,
+        dims=[1, 2],
+    )
+    assert {file.name for file in tmp_path.iterdir()} == {"synergies.png", "vaf.png"}
+
+
+@pytest.mark.parametrize("kind", SYNERGY_MODELS)
+def test_both_stages_run_with_every_kind(kind: str, tmp_path) -> None:
+    run = tmp_path / "run"
+    pictures = f"pictures={str(kind in AFFINE).lower()}"
+    settings = (f"synergies={kind}", "vaf_curve.dims=[1]", "learn.prefill=true")
+    experiment = Experiment(tiny(f"run_dir='{run}'", *settings, pictures))
+    summary = experiment.run()
+    assert summary["learn"]["frames"] == 1208 - 600
+    assert load_bundle(run)[0].num_synergies == 2
+
+
+@pytest.mark.parametrize("kind", AFFINE)
+def test_what_is_fitted_once_adds_no_loss_to_stage_1(kind: str) -> None:
+    found = explorer(f"synergies={kind}")
+    assert found.term is None and found.model.loss is None
+    for _ in range(6):
+        found.stage.collect()
+    found.stage.update()
+    decoder = found.condense()
+    assert torch.equal(found.condense()(torch.ones(2)), decoder(torch.ones(2)))
+    found.stage.close()

@@ -1,0 +1,77 @@
+"""Synergies of anyone's array of actions or muscle activity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchrl_etl.checks import check_choice
+from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
+from torchrl_etl.synergies.gmvae import GMVAESynergies
+from torchrl_etl.synergies.model import SynergyModel
+from torchrl_etl.synergies.nmf import NMFSynergies
+from torchrl_etl.synergies.pca import PCASynergies
+from torchrl_etl.synergies.vae import VAESynergies
+
+__all__ = ["SYNERGY_MODELS", "fit_synergies"]
+
+SYNERGY_MODELS: dict[str, Callable[..., SynergyModel]] = {
+    model.kind: model for model in (GMVAESynergies, VAESynergies, PCASynergies, NMFSynergies)
+}
+"""Kinds of synergies by name."""
+
+
+def fit_synergies(
+    actions: Tensor | np.ndarray | Sequence[Any],
+    kind: str = "gmvae",
+    num_synergies: int = 4,
+    *,
+    low: float | Sequence[float] | Tensor = -1.0,
+    high: float | Sequence[float] | Tensor = 1.0,
+    **options: Any,
+) -> SynergyModel:
+    """Find synergies in an array of actions, EMG or muscle activations [N, n].
+
+    Args:
+        actions (array): [N, n] between the bounds: a tensor, a NumPy array or lists.
+        kind (str): ``"gmvae"``, ``"vae"``, ``"pca"`` or ``"nmf"``; see
+            :data:`~torchrl_etl.synergies.SYNERGY_MODELS`.
+        num_synergies (int): d, at most n.
+
+    Keyword Args:
+        low, high (float, sequence of float or Tensor): bounds, one or [n]; of normalized EMG they
+            are 0 and 1. Default: -1 and 1.
+        **options: of the class of that kind.
+
+    Returns:
+        SynergyModel: the fitted model; its ``decoder(actions)`` is ready for
+        :func:`~torchrl_etl.synergies.save_bundle`.
+
+    Raises:
+        TypeError, ValueError: before anything is fitted, if the kind is unknown, or actions or
+            bounds do not fit (see :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_etl.analysis import variance_accounted_for
+        >>> rng = np.random.default_rng(0)
+        >>> emg = rng.random((500, 3)) @ rng.random((3, 12)) / 3  # three sources, twelve muscles
+        >>> model = fit_synergies(emg, kind="nmf", num_synergies=3, low=0.0, high=1.0)
+        >>> variance_accounted_for(emg, model.reconstruct(emg)) > 0.99
+        True
+        >>> model.decoder(emg).action_dim
+        12
+    """
+    check_choice("kind", kind, list(SYNERGY_MODELS))
+    try:
+        width = np.shape(actions)[-1]
+    except (ValueError, IndexError):  # ragged lists or a number: refused by as_actions
+        width = 1
+    low, high = as_bounds(low, high, width)
+    found = as_actions(actions, low=low, high=high, min_rows=2)
+    model = SYNERGY_MODELS[kind](low, high, num_synergies, **options)
+    model.fit(found)
+    return model

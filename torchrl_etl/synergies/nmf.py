@@ -1,0 +1,83 @@
+"""Synergies as the literature on motor control finds them: non-negative factors."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_etl.checks import check_positive
+from torchrl_etl.modules.synergy_decoder import NEAREST
+from torchrl_etl.synergies.affine import AffineSynergies
+
+__all__ = ["NMFSynergies"]
+
+# As far up as a muscle may be in the middle of the box: beyond, its slope before the bounds is so
+# steep that a small coefficient throws it from one bound to the other.
+_HIGHEST = 0.9
+
+
+class NMFSynergies(AffineSynergies):
+    """Non-negative matrix factorization of how far each action is above its lower bound.
+
+    The model is a = low + c·basis with c, basis ≥ 0 (Lee and Seung, 1999; d'Avella et al., 2003).
+    The decoder has its slope and its action in the middle of the box of coefficients, and bends
+    where a muscle nears its bounds, where the model would pass them.
+
+    Args:
+        low, high (Tensor): bounds of the action [n].
+        num_synergies (int): d, at most n.
+
+    Keyword Args:
+        max_iter (int): iterations of the factorization at most.
+
+    Examples:
+        >>> _ = torch.manual_seed(0)
+        >>> parts = torch.tensor([[0.9, 0.0, 0.5, 0.1], [0.0, 0.4, 0.4, 0.8]])
+        >>> activity = torch.rand(512, 2) / 2 @ parts  # of four muscles, in [0, 1]
+        >>> model = NMFSynergies(torch.zeros(4), torch.ones(4), 2)
+        >>> model.fit(activity)
+        >>> torch.allclose(model.reconstruct(activity), activity, atol=0.02)
+        True
+        >>> bool((model.basis >= 0).all())
+        True
+    """
+
+    kind = "nmf"
+
+    def __init__(
+        self, low: Tensor, high: Tensor, num_synergies: int, *, max_iter: int = 500
+    ) -> None:
+        check_positive(max_iter=max_iter)
+        super().__init__(low, high, num_synergies)
+        self.max_iter = max_iter
+
+    def factorize(self, actions: np.ndarray) -> np.ndarray:
+        # Takes a second to import, which a worker that only decodes should not spend.
+        from sklearn.decomposition import NMF
+        from sklearn.exceptions import ConvergenceWarning
+
+        self.model = NMF(self.num_synergies, init="nndsvda", max_iter=self.max_iter, random_state=0)
+        with warnings.catch_warnings():
+            # The last digits that more iterations would bring do not change a synergy.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            self.model.fit(self._above_low(actions))
+        return self.model.components_
+
+    def coefficients(self, actions: Tensor) -> Tensor:
+        rows = actions.detach().reshape(-1, len(self.low)).cpu().double().numpy()
+        found = torch.as_tensor(self.model.transform(self._above_low(rows)))
+        return found.to(self.low).reshape(*actions.shape[:-1], self.num_synergies)
+
+    def compose(self, coefficients: Tensor) -> Tensor:
+        return self.low + coefficients @ self.basis
+
+    def inside(self, center: Tensor) -> Tensor:
+        half = (self.high - self.low) / 2
+        unit = (center - self.low) / half - 1
+        return self.low + half * (unit.clamp(-NEAREST, _HIGHEST) + 1)
+
+    def _above_low(self, actions: np.ndarray) -> np.ndarray:
+        return (actions - self.low.cpu().double().numpy()).clip(min=0.0)
