@@ -76,7 +76,7 @@ def main() -> None:
         arguments.out,
         task=experiment.task.env_id,
         actuators=experiment.context.spec.actuators,
-        num_components=model.num_components,
+        kind=model.kind,
         facts=known,
     )
     print(json.dumps(known))

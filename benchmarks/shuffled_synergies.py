@@ -38,12 +38,14 @@ def main() -> None:
     with torch.no_grad():
         last.weight.copy_(last.weight[places])
         last.bias.copy_(last.bias[places])
+    decoder.carry(None)  # its encoder knows the muscles by their places of before
     save_bundle(
         decoder,
         arguments.out / "synergies",
         task=info.task,
         actuators=info.actuators,
         num_components=info.num_components,
+        kind=info.kind,
         facts=dict(info.facts) | {"shuffled": places.tolist()},
     )
     rows = load_file(arguments.run / "explored.safetensors")

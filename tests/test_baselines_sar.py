@@ -209,7 +209,7 @@ def test_bad_arguments_are_refused() -> None:
         SARDecoder(torch.zeros(3), torch.zeros(2, 4))
     with pytest.raises(ValueError, match="every lower bound must be finite and below"):
         by_hand(low=1.0, high=1.0)
-    with pytest.raises(ValueError, match=r"shape \[2\] but there are 3 actuators"):
+    with pytest.raises(ValueError, match=r"shape \(2,\) but there are 3 actuators"):
         by_hand(low=[0.0, 0.0])
 
 
@@ -349,3 +349,26 @@ def test_the_learn_stage_learns_through_it(blend: float) -> None:
         assert all(torch.equal(v, fixed[k]) for k, v in decoder.state_dict().items())
     finally:
         stage.close()
+
+
+@pytest.mark.parametrize("blend", [0.66, 1.0])
+def test_encode_inverts_decode_inside_the_bounds(blend: float) -> None:
+    decoder = SARDecoder(
+        torch.tensor([0.4, 0.5, 0.6]),
+        torch.tensor([[0.2, 0.0, 0.1], [0.0, 0.1, -0.1]]),
+        low=0.0,
+        blend=blend,
+    )
+    synergy = torch.zeros(50, decoder.synergy_dim)
+    synergy[:, :2] = 2 * torch.rand(50, 2) - 1
+    found = decoder.encode(decode(decoder, synergy))
+    torch.testing.assert_close(found, synergy[:, :2], atol=1e-5, rtol=0)
+
+
+def test_log_slope_is_the_determinant_inside_the_bounds() -> None:
+    decoder = by_hand(blend=0.6)
+    row = torch.tensor([0.2, -0.1, 0.3, 0.1, -0.2])
+    found = torch.func.jacrev(decoder.module)(row)[:, 2:].slogdet().logabsdet
+    middle = 3 * torch.tensor(0.4).log()  # half of a range of 2 is 1
+    torch.testing.assert_close(decoder.log_slope(row), found - middle)
+    assert decoder.log_slope(row.expand(4, 5)).tolist() == [0.0] * 4

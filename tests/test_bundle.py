@@ -1,5 +1,6 @@
 """The synergy bundle survives the disk bit for bit, or says in one sentence why not."""
 
+import copy
 import hashlib
 import json
 import os
@@ -8,6 +9,7 @@ import shutil
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from tensordict import TensorDict
 
@@ -22,14 +24,19 @@ from torchrl_etl.modules.bundle import (
 )
 
 NAMES = ("biceps", "triceps", "deltoid", "soleus", "psoas")
+LOW, HIGH = [0.0, -1.0, 0.0, 0.1, 0.0], [1.0, 1.0, 2.0, 0.7, 1.0]
+
+
+def actions(rows):
+    """Between the bounds of the decoder."""
+    low, high = torch.tensor(LOW), torch.tensor(HIGH)
+    return low + torch.rand(rows, 5) * (high - low)
 
 
 def fitted_decoder(seed=0, **kwargs):
     torch.manual_seed(seed)
-    low, high = [0.0, -1.0, 0.0, 0.1, 0.0], [1.0, 1.0, 2.0, 0.7, 1.0]
-    gmvae = GMVAE(5, 2, num_components=3, low=low, high=high, hidden=(8, 16))
-    inside = gmvae.low + (gmvae.high - gmvae.low) * torch.rand(64, 5)
-    return SynergyDecoder.from_gmvae(gmvae, inside, **kwargs)
+    gmvae = GMVAE(5, 2, num_components=3, low=LOW, high=HIGH, hidden=(8, 16))
+    return SynergyDecoder.from_gmvae(gmvae, actions(64), **kwargs)
 
 
 def save(decoder, path, **facts):
@@ -110,7 +117,7 @@ DAMAGE = {
     "json in .* cannot be read": lambda f: (f / "synergies.json").unlink(),
     "is not JSON": lambda f: (f / "synergies.json").write_text("{"),
     "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("[1]"),
-    "format version 2 and this torchrl_etl reads 1": lambda f: edit(f, format_version=2),
+    "format version 3 and this torchrl_etl reads 1 and 2": lambda f: edit(f, format_version=3),
     r"lacks \['task'\]": lambda f: edit(f, task=None),
     r"the unknown \['surprise'\]": lambda f: edit(f, surprise=1),
     "'x' as low where a JSON array belongs": lambda f: edit(f, low="x"),
@@ -248,3 +255,27 @@ def test_a_decoder_that_is_not_finite_is_not_saved(fault, tmp_path):
     with pytest.raises(BundleError, match="not finite"):
         save_bundle(decoder, tmp_path / "own", task="toy", actuators=["a", "b", "c"])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_bundle_of_format_1_loads_and_says_that_it_cannot_encode(bundle):
+    new = load_bundle(bundle)[0]
+    state = safetensors.torch.load_file(bundle / "synergies.safetensors")
+    content = safetensors.torch.save(
+        {key: value for key, value in state.items() if not key.startswith("encoder.")}
+    )
+    (bundle / "synergies.safetensors").write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    edit(bundle, format_version=1, kind=None, encoder=None, sha256=digest)
+    old, described = load_bundle(bundle)
+    assert same_weights(old, new) and old.encoder is None
+    assert (described.kind, described.format_version) == ("gmvae", 1)
+    with pytest.raises(RuntimeError, match="has no encoder, so actions cannot be turned into"):
+        old.encode(actions(3))
+
+
+def test_the_encoder_is_kept_out_of_the_decoders_weights_and_follows_its_dtype(bundle):
+    decoder = load_bundle(bundle)[0]
+    assert not any("encoder" in key for key in decoder.state_dict())
+    assert not any(parameter.requires_grad for parameter in decoder.encoder.parameters())
+    assert copy.deepcopy(decoder).double().encode(actions(3)).dtype == torch.float64
+    assert decoder.encode(actions(3)).dtype == torch.float32

@@ -24,7 +24,7 @@ def uses():
     """Whoever takes recorded actions, with one signature."""
     yield "fit_gmvae", lambda model, actions: fit_gmvae(model, actions, updates=2)
     yield "from_gmvae", lambda model, actions: SynergyDecoder.from_gmvae(model, actions)
-    yield "encode", lambda model, actions: SynergyDecoder(2, 4).encode(model, actions)
+    yield "encode", lambda model, actions: SynergyDecoder.from_gmvae(model).encode(actions)
 
 
 USES = [pytest.param(use, id=name) for name, use in uses()]
@@ -93,7 +93,7 @@ def test_one_row_is_refused_and_rows_all_alike_are_warned_of_where_synergies_are
 
 
 def test_one_action_is_enough_to_encode():
-    assert SynergyDecoder(2, 4).encode(gmvae(), ACTIONS[0]).shape == (2,)
+    assert SynergyDecoder.from_gmvae(gmvae()).encode(ACTIONS[0]).shape == (2,)
 
 
 def test_a_small_overshoot_of_the_bounds_is_taken():

@@ -11,7 +11,13 @@ from tests.configs import tiny
 from tests.stages import explorer
 from torchrl_etl.analysis import describe_synergies, draw_synergies, variance_accounted_for
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.synergies import SYNERGY_MODELS, SynergyModel, fit_synergies, load_bundle
+from torchrl_etl.synergies import (
+    SYNERGY_MODELS,
+    SynergyModel,
+    fit_synergies,
+    load_bundle,
+    save_bundle,
+)
 
 AFFINE = ("pca", "nmf")
 FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden": (8,)}}
@@ -111,7 +117,7 @@ def test_a_vae_is_a_gmvae_of_one_component_to_the_bit() -> None:
     one = fitted("vae", actions)
     torch.manual_seed(1)
     other = fit_synergies(actions, "gmvae", 2, low=0.0, high=1.0, num_components=1, **FEW["gmvae"])
-    assert one.num_components == 1
+    assert one.model.num_components == 1
     assert torch.equal(one.reconstruct(actions), other.reconstruct(actions))
 
 
@@ -195,3 +201,39 @@ def test_what_is_fitted_once_adds_no_loss_to_stage_1(kind: str) -> None:
     decoder = found.condense()
     assert torch.equal(found.condense()(torch.ones(2)), decoder(torch.ones(2)))
     found.stage.close()
+
+
+@pytest.mark.parametrize("kind", SYNERGY_MODELS)
+def test_a_bundle_of_every_kind_encodes_and_decodes_as_what_was_saved(kind: str, tmp_path) -> None:
+    actions = activity()
+    decoder = fitted(kind, actions).decoder(actions, residual=0.5)
+    save_bundle(decoder, tmp_path / "b", task="toy", actuators=list("abcdef"), kind=kind)
+    copy, info = load_bundle(tmp_path / "b")
+    assert info.kind == kind and info.format_version == 2
+    assert info.num_components == {"gmvae": 2, "vae": 1}.get(kind)
+    synergy = 2 * torch.rand(20, 8) - 1
+    assert torch.equal(copy(synergy), decoder(synergy))
+    assert torch.equal(copy.encode(actions), decoder.encode(actions))
+    assert copy.state_dict().keys() == decoder.state_dict().keys()
+
+
+@pytest.mark.parametrize("kind", AFFINE)
+def test_encode_inverts_decode(kind: str) -> None:
+    actions = activity()
+    for residual in (0.0, 0.5):
+        decoder = fitted(kind, actions).decoder(actions, residual=residual)
+        synergy = 2 * torch.rand(3, 50, 2) - 1
+        silent = torch.zeros(3, 50, decoder.synergy_dim - 2)
+        found = decoder.encode(decoder(torch.cat([synergy, silent], -1)))
+        torch.testing.assert_close(found, synergy, atol=1e-3, rtol=0)
+    assert decoder.encode(actions.numpy()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("kind", SYNERGY_MODELS)
+def test_log_slope_is_the_determinant_against_the_middle_of_the_range(kind: str) -> None:
+    actions = activity()
+    decoder = fitted(kind, actions).decoder(actions, residual=0.4).double()
+    for row in 2 * torch.rand(3, 8, dtype=torch.float64) - 1:
+        found = torch.func.jacrev(decoder.module)(row)[:, 2:].slogdet().logabsdet
+        middle = 6 * torch.tensor(0.4 / 2, dtype=torch.float64).log()
+        torch.testing.assert_close(decoder.log_slope(row), found - middle)

@@ -55,7 +55,7 @@ def test_coefficients_of_decoded_actions_are_found_again():
     actions = torch.tanh(coefficients @ torch.randn(2, 16))
     gmvae = fit_gmvae(GMVAE(16, 2, num_components=1), actions, updates=1500)
     decoder = SynergyDecoder.from_gmvae(gmvae, actions)
-    found = decoder.encode(gmvae, actions)
+    found = decoder.encode(actions)
     again = decoder(TensorDict({"synergy": found}, [512]))["action"]
     assert found.abs().max() <= 1
     assert (again - actions).square().mean() < 0.1 * actions.var(0).mean()

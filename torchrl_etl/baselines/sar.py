@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_positive
-from torchrl_etl.modules.recorded_actions import as_bounds
+from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.modules.synergy_decoder import SynergyMap
 
 __all__ = ["SARDecoder", "best_episodes"]
@@ -163,6 +163,22 @@ class SARDecoder(SynergyMap):
         mean, *ends = torch.as_tensor(chain.inverse_transform(corners.double().numpy()))
         basis = torch.stack(ends) - mean
         return cls(mean.to(actions), basis.to(actions), low=low, high=high, blend=blend, **keys)
+
+    def log_slope(self, synergy: Tensor) -> Tensor:
+        """Zero [*]: inside of the bounds the raw action moves an action as far as in the middle.
+
+        Deviates: an action that is clamped does not move at all. Its noise counts as entropy all
+        the same, as in the public code.
+        """
+        return synergy.new_zeros(synergy.shape[:-1])
+
+    @torch.no_grad()
+    def encode(self, action: Tensor | np.ndarray) -> Tensor:
+        """Coefficients [*, d] of actions [*, n] by least squares, clamped to [-1, 1]."""
+        action = as_actions(action, low=self.low, high=self.high)
+        middle = (self.low + self.high) / 2
+        synergies = (action - self.residual * middle) / self.module.blend - self.module.mean
+        return (synergies @ self.module.basis.pinverse()).clamp(-1, 1)
 
     @property
     def num_synergies(self) -> int:

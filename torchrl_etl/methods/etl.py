@@ -129,7 +129,7 @@ class Explorer:
         kept = rows.select("observation", "action", ("next", "observation"))
         kept["next"].update(rows["next"].select("done", "terminated"))
         kept["next", "reward"] = rows["next", "reward"] / self.stage.reward_scale
-        return kept.set("synergy", self.model.encode(decoder, rows["action"]))
+        return kept.set("synergy", decoder.encode(rows["action"]))
 
 
 class ETL(Method):
@@ -239,7 +239,7 @@ class ETL(Method):
             context.folder.synergies,
             task=resolve_task(context.config.env, context.config.goal).env_id,
             actuators=context.spec.actuators,
-            num_components=explorer.model.num_components,
+            kind=explorer.model.kind,
             facts={**numbers, "seed": context.config.seed, **facts()},
         )
 

@@ -1,8 +1,9 @@
 """The synergy bundle: a learned decoder on disk, in two files that hold no code.
 
-``synergies.safetensors`` is the decoder's state dict. ``synergies.json`` is everything else: how
-to rebuild the decoder, which muscles it moves and within which bounds, facts about its training,
-and the SHA-256 of the tensors.
+``synergies.safetensors`` is the decoder's state dict, and with the prefix ``encoder.`` that of the
+model it encodes with, if it has one. ``synergies.json`` is everything else: how to rebuild them,
+which muscles they are of and within which bounds, facts about the training, and the SHA-256 of the
+tensors.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_etl.io import replace_folder, surviving_folder
+from torchrl_etl.modules.gmvae import GMVAE
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 
 __all__ = [
@@ -35,7 +37,8 @@ __all__ = [
     "save_bundle",
 ]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1 had neither kind nor encoder
+_ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
 _DESCRIPTION = "synergies.json"
 
@@ -58,6 +61,8 @@ class BundleInfo:
         sha256 (str): digest of the tensors file.
         num_components (int, optional): mixture components of the GMVAE it came from.
         facts (dict): frames, seed, commit, versions, variance accounted for, and the like.
+        kind (str): kind of synergies, such as ``"gmvae"`` or ``"nmf"``.
+        encoder (dict, optional): constructor arguments of the encoder, if there is one.
         format_version (int): version of this layout.
     """
 
@@ -71,6 +76,8 @@ class BundleInfo:
     sha256: str
     num_components: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
+    kind: str = "gmvae"
+    encoder: dict[str, Any] | None = None
     format_version: int = FORMAT_VERSION
 
 
@@ -82,8 +89,12 @@ def save_bundle(
     actuators: Sequence[str],
     facts: Mapping[str, Any] | None = None,
     num_components: int | None = None,
+    kind: str | None = None,
 ) -> Path:
     """Write a decoder and its description to the folder ``path``, whole or not at all.
+
+    With the decoder goes the encoder that it carries, if any, so that who loads it can relabel
+    recorded actions.
 
     A bundle already there is replaced. A crash at any point leaves the old bundle or the new one
     for :func:`load_bundle` to find. One process at a time may save to a path.
@@ -97,7 +108,10 @@ def save_bundle(
         actuators (sequence of str): names of the n actuators, in action order.
         facts (mapping, optional): anything JSON can hold; scalars of torch and numpy and paths are
             converted, numbers that are not finite become null.
-        num_components (int, optional): mixture components of the GMVAE it came from.
+        num_components (int, optional): mixture components of the GMVAE it came from. Default: those
+            of its encoder.
+        kind (str, optional): kind of synergies. Default: ``"affine"`` for a decoder without hidden
+            layers, else ``"gmvae"``.
 
     Returns:
         Path: the folder.
@@ -124,14 +138,18 @@ def save_bundle(
             f"{len(actuators)} actuator names ({len(set(actuators))} different) came with a "
             f"decoder for {decoder.action_dim} actuators; pass one name for each, in order."
         )
-    for key, value in decoder.state_dict().items():
+    state, encoder = decoder.state_dict(), decoder.encoder
+    if encoder is not None:
+        state |= {f"{_ENCODER}{key}": value for key, value in encoder.state_dict().items()}
+        num_components = encoder.num_components if num_components is None else num_components
+    for key, value in state.items():
         if not value.isfinite().all():
             raise BundleError(
                 f"{key} of the decoder is not finite, so it has no synergies to save; its training "
                 "diverged: lower the learning rate or look for NaN in the actions it was fitted to."
             )
     tensors = safetensors.torch.save(
-        {key: value.detach().cpu().clone() for key, value in decoder.state_dict().items()}
+        {key: value.detach().cpu().clone() for key, value in state.items()}
     )
     config = _plain(decoder.config, "config")
     info = BundleInfo(
@@ -145,6 +163,8 @@ def save_bundle(
         sha256=hashlib.sha256(tensors).hexdigest(),
         num_components=num_components,
         facts=_plain(dict(facts or {}), "facts"),
+        kind=_default_kind(decoder.is_affine) if kind is None else kind,
+        encoder=None if encoder is None else encoder.config,
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
     folder = Path(path).resolve()
@@ -218,11 +238,16 @@ def load_bundle(
         # The weights drawn here are overwritten at once: do not let them advance the global seed.
         with torch.random.fork_rng(devices=[]):
             decoder = SynergyDecoder(**config, in_keys=in_keys, out_keys=out_keys)
+            encoder = None if info.encoder is None else GMVAE(**info.encoder)
+        if encoder is not None:
+            inner = {key for key in state if key.startswith(_ENCODER)}
+            encoder.load_state_dict({key.removeprefix(_ENCODER): state.pop(key) for key in inner})
         decoder.load_state_dict(state)
     except (TypeError, ValueError, RuntimeError) as error:
         raise BundleError(
             f"The config and the tensors in {str(folder)!r} do not make a SynergyDecoder: {error}"
         ) from error
+    decoder.carry(encoder)
     bounds = tuple(decoder.low.tolist()), tuple(decoder.high.tolist())
     if bounds != (info.low, info.high) or decoder.action_dim != len(info.actuators):
         raise BundleError(
@@ -309,6 +334,10 @@ def check_compatible(
             )
 
 
+def _default_kind(is_affine: bool) -> str:
+    return "affine" if is_affine else "gmvae"
+
+
 def _explain_names(info: BundleInfo, actuators: tuple[str, ...]) -> str:
     missing = [name for name in info.actuators if name not in actuators]
     extra = [name for name in actuators if name not in info.actuators]
@@ -392,12 +421,14 @@ def _read_description(folder: Path) -> BundleInfo:
     version = content.get("format_version") if isinstance(content, dict) else None
     if version is None:
         raise BundleError(f"{name} has no format_version: it does not describe a synergy bundle.")
-    if version != FORMAT_VERSION:
+    if version not in (1, FORMAT_VERSION):
         raise BundleError(
-            f"{name} has format version {version!r} and this torchrl_etl reads {FORMAT_VERSION}; "
-            "load it with the version that wrote it, or explore anew."
+            f"{name} has format version {version!r} and this torchrl_etl reads 1 and "
+            f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
         )
     known = {item.name for item in fields(BundleInfo)}
+    if version == 1:
+        content = {"kind": "", "encoder": None, **content}
     if set(content) != known:
         missing, extra = sorted(known - set(content)), sorted(set(content) - known)
         raise BundleError(
@@ -411,5 +442,12 @@ def _read_description(folder: Path) -> BundleInfo:
                 f"{name} has {content[key]!r} as {key} where a JSON "
                 f"{'array' if kind is list else 'object'} belongs; copy the bundle again."
             )
+    if version == 1:
+        content["kind"] = _default_kind(not content["config"].get("hidden", True))
+    if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
+        raise BundleError(
+            f"{name} has {content['kind']!r} as kind, which must be a text, and "
+            f"{content['encoder']!r} as encoder, an object or null; copy the bundle again."
+        )
     content |= {key: tuple(content[key]) for key in ("actuators", "low", "high")}
     return BundleInfo(**content)

@@ -210,6 +210,18 @@ class GMVAE(nn.Module):
         )
 
     @property
+    def config(self) -> dict[str, Any]:
+        """JSON-able arguments: ``GMVAE(**config)`` plus a state dict rebuilds it."""
+        return {
+            "action_dim": self.action_dim,
+            "latent_dim": self.latent_dim,
+            "num_components": self.num_components,
+            "low": self.low.tolist(),
+            "high": self.high.tolist(),
+            "hidden": list(reversed(self.decoder.hidden)),
+        }
+
+    @property
     def low(self) -> Tensor:
         return self.decoder.low
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -64,6 +65,9 @@ class _ScaledDecoder(nn.Module):
 class SynergyMap(TensorDictModule):
     """What maps synergy coefficients in a box to muscle actions, whatever is inside.
 
+    All that ETL asks of a decoder: call it, and it decodes; :meth:`log_slope` corrects the entropy
+    of what the policy moves directly; :meth:`encode` relabels recorded actions.
+
     Attributes:
         num_synergies (int): number d of synergies.
         action_dim (int): number n of actuators.
@@ -76,6 +80,25 @@ class SynergyMap(TensorDictModule):
     residual: float
     low: Tensor
     high: Tensor
+
+    @abstractmethod
+    def log_slope(self, synergy: Tensor) -> Tensor:
+        """How far the action moves with the residual: ln |det ∂a/∂r| [*] at ``synergy`` [*, d+n].
+
+        Relative to where the synergies leave every muscle in the middle of its range; 0 without a
+        residual.
+        """
+
+    @abstractmethod
+    def encode(self, action: Tensor | np.ndarray) -> Tensor:
+        """Coefficients in [-1, 1]^d that with a residual of zero come near to actions [*, n].
+
+        Returns:
+            Tensor: [*, d], without gradients and without a residual.
+
+        Raises:
+            TypeError, ValueError: see :func:`~torchrl_etl.modules.recorded_actions.as_actions`.
+        """
 
     @property
     def synergy_dim(self) -> int:
@@ -117,6 +140,10 @@ class SynergyDecoder(SynergyMap):
     Keys:
         reads ``synergy`` [*, d] (or [*, d+n]) in [-1, 1]; writes ``action`` [*, n] in [low, high].
 
+    Attributes:
+        encoder (GMVAE, optional): a frozen copy of the model that the decoder was made from, by
+            which it encodes. It is no submodule: nothing trains it, and it is in no state dict.
+
     Raises:
         ValueError: if a size is not positive or ρ is outside [0, 1].
 
@@ -154,6 +181,18 @@ class SynergyDecoder(SynergyMap):
             _ScaledDecoder(decoder, residual), in_keys=list(in_keys), out_keys=list(out_keys)
         )
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
+        self.carry(None)
+
+    def carry(self, encoder: GMVAE | None) -> None:
+        """Encode by a frozen copy of this model from now on."""
+        if encoder is not None:
+            encoder = deepcopy(encoder).requires_grad_(False)
+        object.__setattr__(self, "encoder", encoder)  # not as a submodule
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SynergyDecoder:
+        if self.encoder is not None:  # follows to a device or dtype
+            self.encoder._apply(fn, recurse)
+        return super()._apply(fn, recurse)
 
     @classmethod
     def from_gmvae(
@@ -164,7 +203,7 @@ class SynergyDecoder(SynergyMap):
         residual: float = 0.0,
         **keys: Any,
     ) -> SynergyDecoder:
-        """Take over a copy of the GMVAE's decoder.
+        """Take over a copy of the GMVAE's decoder, and one of the GMVAE as :attr:`encoder`.
 
         Args:
             gmvae (GMVAE): the fitted model; left as it is.
@@ -201,6 +240,7 @@ class SynergyDecoder(SynergyMap):
                 )
             scaled.center.copy_(center)
             scaled.scale.copy_(scale.clamp_min(1e-6))
+        decoder.carry(gmvae)
         return decoder
 
     @classmethod
@@ -263,24 +303,40 @@ class SynergyDecoder(SynergyMap):
         return decoder
 
     def log_slope(self, synergy: Tensor) -> Tensor:
-        """How far the action moves with the residual: ln |det ∂a/∂r| [*] at ``synergy`` [*, d+n].
-
-        Relative to where the synergies leave every muscle in the middle of its range; 0 without a
-        residual.
-        """
         if not self.residual:
             return synergy.new_zeros(synergy.shape[:-1])
         return tanh_sum_log_slope(*self.module.summands(synergy)).sum(-1)
 
-    @torch.no_grad()
-    def encode(self, gmvae: GMVAE, action: Tensor | np.ndarray) -> Tensor:
-        """Coefficients [*, d] of actions [*, n], by the GMVAE that the decoder is from.
+    @property
+    def is_affine(self) -> bool:
+        """Whether it is affine before the bounds, as one of :meth:`from_directions` is."""
+        return not self.module.decoder.hidden
 
-        They are clamped to the box that a policy acts in.
+    @torch.no_grad()
+    def encode(self, action: Tensor | np.ndarray) -> Tensor:
+        """Coefficients [*, d] of actions [*, n], clamped to the box that a policy acts in.
+
+        An affine map is inverted by least squares before the bounds, where a muscle at its bound
+        counts as 0.99 of the way there. Another decoder infers them with its :attr:`encoder`, also
+        after it was fine-tuned.
+
+        Raises:
+            RuntimeError: if the decoder is not affine and has no encoder.
         """
-        action = as_actions(action, low=gmvae.low, high=gmvae.high)
+        action = as_actions(action, low=self.low, high=self.high)
         scaled = self.module
-        return ((gmvae.infer(action) - scaled.center) / scaled.scale).clamp(-1, 1)
+        if self.is_affine:
+            (layer,) = (m for m in scaled.decoder.modules() if isinstance(m, nn.Linear))
+            unit = scaled.decoder.normalize(action).clamp(-NEAREST, NEAREST)
+            latent = (unit.atanh() - layer.bias) @ layer.weight.pinverse().mT
+        elif self.encoder is not None:
+            latent = self.encoder.infer(action)
+        else:
+            raise RuntimeError(
+                "This decoder has no encoder, so actions cannot be turned into its coefficients; "
+                "make it with SynergyDecoder.from_gmvae, or load a bundle that holds one."
+            )
+        return ((latent - scaled.center) / scaled.scale).clamp(-1, 1)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -60,7 +60,6 @@ class GMVAESynergies(SynergyModel):
             high=high.tolist(),
             hidden=hidden,
         ).to(low.device)
-        self.num_components = self.model.num_components
         self.loss = GMVAELoss(
             self.model, kl_weight=kl_weight, component_kl_weight=component_kl_weight
         )
@@ -73,9 +72,6 @@ class GMVAESynergies(SynergyModel):
 
     def reconstruct(self, actions: Tensor) -> Tensor:
         return self.model.reconstruct(actions)
-
-    def encode(self, decoder: SynergyDecoder, actions: Tensor) -> Tensor:
-        return decoder.encode(self.model, actions)
 
 
 def fit_gmvae(

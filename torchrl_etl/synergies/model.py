@@ -26,14 +26,12 @@ class SynergyModel(ABC):
         loss (LossModule, optional): trained beside stage 1 on entry ``action``; ``None`` for a
             model that is fitted once, when all actions are known.
         lr (float): learning rate of the loss.
-        num_components (int, optional): of a mixture.
     """
 
     kind: ClassVar[str]
     num_synergies: int
     loss: LossModule | None = None
     lr: float = 1e-3
-    num_components: int | None = None
 
     @abstractmethod
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:

@@ -60,10 +60,13 @@ class NMFSynergies(AffineSynergies):
         from sklearn.exceptions import ConvergenceWarning
 
         self.model = NMF(self.num_synergies, init="nndsvda", max_iter=self.max_iter, random_state=0)
+        above = self._above_low(actions)
+        # Where no muscle ever moves there is nothing to divide, and it fails.
+        above[0] += 1e-9 * (not above.any())
         with warnings.catch_warnings():
             # The last digits that more iterations would bring do not change a synergy.
             warnings.simplefilter("ignore", ConvergenceWarning)
-            self.model.fit(self._above_low(actions))
+            self.model.fit(above)
         return self.model.components_
 
     def coefficients(self, actions: Tensor) -> Tensor:
