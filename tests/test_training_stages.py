@@ -42,8 +42,9 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
 
 
 def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
-    found, second = explorer("action_repeat=2"), learn_stage(None, "action_repeat=2")
+    found = explorer("action_repeat=2")
     found.stage.collect()
+    second = learn_stage(SynergyDecoder.from_gmvae(found.model.model), "action_repeat=2")
     second.prefill(found.transitions(second.learner.decoder))
     assert second.progress.owed == 2 * 32 * second.replay_ratio
     found.stage.close(), second.close()
