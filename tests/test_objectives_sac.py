@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import (
+    CompositeDistribution,
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
 from torchrl.data import Bounded
-from torchrl.modules import ValueOperator
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from tests import test_objectives_synergy_sac as synergy
@@ -107,6 +115,116 @@ def test_what_it_cannot_do_is_refused() -> None:
         LeanSACLoss(actor, critic, value_network=value)
     with pytest.raises(TypeError, match="qvalue_network is a Linear"):
         LeanSACLoss(actor, nn.Linear(2, 5))
+    with pytest.raises(TypeError, match="actor_network is a Linear"):
+        LeanSACLoss(nn.Linear(2, 5), critic)
+
+
+class Value(nn.Module):
+    """Q-values [*, 1] of an action that may come in two parts; a second output beside them."""
+
+    def __init__(self, *, outputs: int = 1) -> None:
+        super().__init__()
+        self.layer = nn.Linear(OBSERVATION + ACTION, outputs)
+
+    def forward(self, state: Any, move: Any) -> Any:
+        if isinstance(move, TensorDict):
+            move = torch.cat([move["left"], move["right"]], -1)
+        values = self.layer(torch.cat([state, move], -1)).unbind(-1)
+        values = tuple(value.unsqueeze(-1) for value in values)
+        return values if len(values) > 1 else values[0]
+
+
+def sequence() -> TensorDictSequential:
+    return TensorDictSequential(
+        TensorDictModule(nn.Linear(OBSERVATION, 4), ["observation"], ["hidden"]),
+        TensorDictModule(nn.Linear(4, OBSERVATION), ["hidden"], ["features"]),
+        TensorDictModule(Value(), ["features", "action"], ["state_action_value"]),
+    )
+
+
+def two_outputs() -> TensorDictModule:
+    outputs = ["beside", "state_action_value"]
+    return TensorDictModule(Value(outputs=2), ["observation", "action"], outputs)
+
+
+def keyword_inputs() -> TensorDictModule:
+    names = {"move": "action", "state": "observation"}
+    return TensorDictModule(Value(), names, ["state_action_value"])
+
+
+def composite_actor(**parts: Any) -> ProbabilisticActor:
+    """Of the parts "left" [*, 2] and "right" [*, 3] of an action."""
+
+    class Parameters(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Sequential(nn.Linear(OBSERVATION, 2 * ACTION), NormalParamExtractor())
+
+        def forward(self, observation: Any) -> Any:
+            loc, scale = self.net(observation)
+            return loc[..., :2], scale[..., :2], loc[..., 2:], scale[..., 2:]
+
+    sides = [("params", side, name) for side in ("left", "right") for name in ("loc", "scale")]
+    maps = {"distribution_map": {"left": TanhNormal, "right": TanhNormal}, **parts}
+    return ProbabilisticActor(
+        TensorDictModule(Parameters(), ["observation"], sides),
+        in_keys=["params"],
+        out_keys=list(parts.get("name_map", {"action": None})),
+        distribution_class=partial(CompositeDistribution, **maps),
+    )
+
+
+def assert_same_numbers(actor: Any, critic: Any, data: TensorDict) -> None:
+    outs = []
+    for kind in (SACLoss, LeanSACLoss):
+        options = {"target_entropy": -1.0, "loss_function": "l2"}
+        torch.manual_seed(SEED)
+        loss = kind(deepcopy(actor), deepcopy(critic), **options)
+        SoftUpdate(loss, tau=0.1)
+        torch.manual_seed(SEED)
+        batch = data.clone()
+        out = loss(batch)
+        if kind is LeanSACLoss:  # TorchRL's leaves loc and scale
+            assert set(batch.keys(True)) == {*data.keys(True), "td_error"}
+        sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()
+        gradients = {k: v.grad for k, v in loss.named_parameters() if v.grad is not None}
+        outs.append(({k: v.detach() for k, v in out.items()}, gradients))
+    (theirs, their_gradients), (ours, our_gradients) = outs
+    torch.testing.assert_close(ours, theirs)
+    torch.testing.assert_close(our_gradients, their_gradients)
+
+
+@pytest.mark.parametrize("make", [sequence, two_outputs, keyword_inputs])
+def test_critics_of_any_make_give_the_numbers_of_torchrls_loss(make: Any) -> None:
+    actor = make_loss().actor_network
+    torch.manual_seed(SEED)
+    assert_same_numbers(actor, make(), TestLeanSACLoss().data((8,)))
+
+
+def test_a_composite_action_under_one_key_gives_the_numbers_of_torchrls_loss() -> None:
+    torch.manual_seed(SEED)
+    data = TestLeanSACLoss().data((8,))
+    left, right = data["action"].split([2, 3], -1)
+    data["action"] = TensorDict({"left": left, "right": right}, [8])
+    critic = TensorDictModule(Value(), ["observation", "action"], ["state_action_value"])
+    assert_same_numbers(composite_actor(), critic, data)
+
+
+def test_a_composite_action_under_several_keys_is_refused() -> None:
+    actor = composite_actor(name_map={"left": "left", "right": "right"})
+    with pytest.raises(ValueError, match=r"The actor samples \['left', 'right'\]"):
+        LeanSACLoss(actor, keyword_inputs())
+
+
+def test_a_critic_of_several_outputs_needs_one_that_is_named_as_the_value() -> None:
+    actor, critic = make_loss().actor_network, two_outputs()
+    loss = LeanSACLoss(actor, critic, target_entropy=-1.0)
+    with pytest.raises(ValueError, match="let one of them be 'q'"):
+        loss.set_keys(state_action_value="q")
+    loss.set_keys(state_action_value="beside")
+    critic.out_keys = ["first", "second"]
+    with pytest.raises(ValueError, match="let one of them be 'state_action_value'"):
+        LeanSACLoss(actor, critic, target_entropy=-1.0)
 
 
 @pytest.mark.parametrize("rate", [{"tau": 0.1}, {"eps": 0.9}])

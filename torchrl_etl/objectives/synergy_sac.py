@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -169,5 +169,7 @@ class SynergySACLoss(LeanSACLoss):
         return inputs.set(self.decoded_key, self._decode(action))
 
     def _decode(self, synergy: Tensor) -> Tensor:
+        decoder = self.decoder_network
         weights = self._weights("decoder_network", detached=not self.train_decoder)
-        return call(self.decoder_network, weights, synergy)
+        inputs = TensorDict({decoder.in_keys[0]: synergy}, synergy.shape[:-1])
+        return call(decoder, weights, inputs, self.decoded_key)
