@@ -26,7 +26,7 @@ from rich.table import Table
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.collectors import STOP_SIGNALS
-from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
+from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
 from torchrl_etl.training import Bench, Run, validate
 
 HERE = Path(__file__).parent
@@ -103,7 +103,7 @@ def compose(overrides: Sequence[str]) -> DictConfig:
     """What ``etl_sac.py`` would make of these."""
     hydra.core.global_hydra.GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        return hydra.compose("config", [*overrides, "run_dir=unused"])
+        return hydra.compose("config", [*translate(overrides, CONF), "run_dir=unused"])
 
 
 class Display:

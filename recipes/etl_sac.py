@@ -23,7 +23,13 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from torchrl_etl.collectors import CollectionError
-from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
+from torchrl_etl.command_line import (
+    check_overrides,
+    one_sentence,
+    quiet_torchrl,
+    quote_paths,
+    translate,
+)
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import Interrupted, resumed_config
@@ -84,6 +90,8 @@ def report(summary: dict[str, Any], folder: Path) -> str:
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = quote_paths(sys.argv[1:], "run_dir", "resume", "synergies")
+    with one_sentence(ValueError):
+        sys.argv[1:] = translate(sys.argv[1:], CONF)
+    sys.argv[1:] = quote_paths(sys.argv[1:], "run_dir", "resume", "synergies.bundle")
     check_overrides(CONF / "config.yaml", sys.argv[1:], __doc__)
     main()

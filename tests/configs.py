@@ -7,6 +7,8 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from torchrl_etl.command_line import translate
+
 ROOT = Path(__file__).parent.parent
 CONF = ROOT / "recipes" / "conf"
 
@@ -45,4 +47,4 @@ def tiny(*overrides: str, name: str = "config") -> DictConfig:
     of_networks = {"synergies=pca", "synergies=nmf"}.isdisjoint(overrides)
     small = [key for key in TINY if of_networks or not key.startswith("synergies.")]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, overrides=[*small, *overrides])
+        return compose(name, overrides=translate([*small, *overrides], CONF))

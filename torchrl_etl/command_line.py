@@ -6,19 +6,21 @@ import difflib
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.checks import check_choice
+from torchrl_etl.training.config import RENAMED
 
 __all__ = [
     "check_overrides",
     "one_sentence",
     "quiet_torchrl",
     "quote_paths",
+    "translate",
 ]
 
 
@@ -69,9 +71,55 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
             near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
-        if choices.get(key):
+        if choices.get(key) and value != "null":
             with one_sentence(ValueError):
                 check_choice(key, value, choices[key])
+
+
+def translate(arguments: Sequence[str], groups: Path) -> list[str]:
+    """Short and former ways to write a setting, as Hydra reads them.
+
+    ``synergies=PATH`` is ``synergies.bundle=PATH`` unless it names a kind, ``KIND`` of
+    ``synergies.kind=KIND`` and ``exploration.kind=KIND`` brings that kind's other settings, and the
+    presets that hold today's defaults are no preset.
+
+    Args:
+        arguments (sequence of str): the command line without the program.
+        groups (path): the folder of the configuration's groups.
+
+    Raises:
+        ValueError: for a setting that has another name now, which it tells.
+
+    Examples:
+        >>> groups = Path("recipes/conf")
+        >>> translate(["synergies=runs/a", "exploration.kind=metra", "learner=residual"], groups)
+        ['synergies.bundle=runs/a', 'exploration=metra', 'learner=null']
+        >>> translate(["learn.anchor=0.2"], groups)
+        Traceback (most recent call last):
+        ...
+        ValueError: learn.anchor is called learn.decoder.distillation_weight now.
+    """
+    translated = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        name = key.lstrip("+~")
+        if (old := _former(name)) is not None:
+            raise ValueError(f"{name} is called {RENAMED[old]}{name.removeprefix(old)} now.")
+        kinds = {path.stem for path in (groups / "synergies").glob("*.yaml")}
+        if name in ("synergies.kind", "exploration.kind"):
+            key = name.removesuffix(".kind")
+        elif name == "synergies" and value not in kinds:
+            key = "synergies.bundle"
+        elif argument in ("learner=residual", "experiment=laptop", "faithful=default"):
+            value = "null"
+        translated.append(f"{key}{equals}{value}")
+    return translated
+
+
+def _former(name: str) -> str | None:
+    """The former name of a setting or a section that this one is, or is below."""
+    below = [old for old in RENAMED if f"{name}.".startswith(f"{old}.")]
+    return max(below, key=len, default=None)
 
 
 def quote_paths(arguments: list[str], *keys: str) -> list[str]:

@@ -94,8 +94,8 @@ def validate(config: DictConfig) -> None:
             f"env_kwargs is {config.env_kwargs!r}; it must be arguments by name, such as "
             "env_kwargs={NAME: VALUE}."
         )
-    if config.compile is not None:
-        check_flag(compile=config.compile)
+    if config.compile not in (None, True, False):
+        raise ValueError(f"compile is {config.compile!r}; it must be true, false or null.")
     for name in ("frames", "threads", "num_synergies"):
         if config[name] is not None:
             check_integer(1, **{name: config[name]})
