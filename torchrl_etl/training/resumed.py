@@ -120,7 +120,11 @@ def _override(config: DictConfig, override: Override, newer: Container[str]) -> 
     if known and override.is_add() and not override.is_force_add():
         raise ValueError(f"+{key} is a setting that is there already; leave the plus out.")
     presets = ("learner", "experiment", "faithful")
-    if not known and key not in presets and (not override.is_add() or key.split(".")[0] not in _OPEN_SECTIONS):
+    if (
+        not known
+        and key not in presets
+        and (not override.is_add() or key.split(".")[0] not in _OPEN_SECTIONS)
+    ):
         near = get_close_matches(key, [f"{section}.{k}".lstrip(".") for k in parent or ()], n=1)
         hint = f"did you mean {near[0]}?" if near else "see its config.yaml."
         raise ValueError(f"The run has no setting {key!r}; {hint}")
