@@ -237,3 +237,11 @@ def test_log_slope_is_the_determinant_against_the_middle_of_the_range(kind: str)
         found = torch.func.jacrev(decoder.module)(row)[:, 2:].slogdet().logabsdet
         middle = 6 * torch.tensor(0.4 / 2, dtype=torch.float64).log()
         torch.testing.assert_close(decoder.log_slope(row), found - middle)
+
+
+@pytest.mark.parametrize("setting", ["synergies.kind=nmf", "exploration.kind=metra"])
+def test_a_kind_with_the_options_of_another_is_refused_with_the_setting_that_helps(
+    setting: str,
+) -> None:
+    with pytest.raises(ValueError, match=rf"choose {setting.replace('.kind', '')}, which brings"):
+        explorer(setting)

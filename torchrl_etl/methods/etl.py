@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -328,17 +329,37 @@ class ETL(Method):
 
 def make_exploration(context: Context) -> Exploration:
     options = context.options("exploration")
-    check_choice("exploration.kind", kind := options.pop("kind"), list(EXPLORATIONS))
-    with naming("exploration"):
-        return EXPLORATIONS[kind](context.spec.observation_dim, device=context.device, **options)
+    inputs = (context.spec.observation_dim,)
+    return _make("exploration", EXPLORATIONS, inputs, device=context.device, **options)
 
 
 def make_synergy_model(
     context: Context, num_synergies: int | None = None, **options: Any
 ) -> SynergyModel:
     options = {**context.options("synergies"), **options}
-    check_choice("synergies.kind", kind := options.pop("kind"), list(SYNERGY_MODELS))
     options.pop("bundle")
     number = context.config.num_synergies if num_synergies is None else num_synergies
-    with naming("synergies"):
-        return SYNERGY_MODELS[kind](context.spec.low, context.spec.high, number, **options)
+    inputs = (context.spec.low, context.spec.high, number)
+    return _make("synergies", SYNERGY_MODELS, inputs, **options)
+
+
+def _make(
+    section: str,
+    kinds: Mapping[str, Callable[..., Any]],
+    inputs: tuple,
+    *,
+    kind: str,
+    **options: Any,
+) -> Any:
+    """One of ``kinds`` with the options of its section of the configuration."""
+    check_choice(f"{section}.kind", kind, list(kinds))
+    try:
+        with naming(section):
+            return kinds[kind](*inputs, **options)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise ValueError(
+            f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
+            f"choose {section}={kind}, which brings its own."
+        ) from error
