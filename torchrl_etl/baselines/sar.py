@@ -167,8 +167,8 @@ class SARDecoder(SynergyMap):
     def log_slope(self, synergy: Tensor) -> Tensor:
         """Zero [*]: inside of the bounds the raw action moves an action as far as in the middle.
 
-        Deviates: an action that is clamped does not move at all. Its noise counts as entropy all
-        the same, as in the public code.
+        An action that is clamped does not move at all; its noise counts as entropy all the same, as
+        it does in the public code.
         """
         return synergy.new_zeros(synergy.shape[:-1])
 

@@ -327,6 +327,9 @@ class ETL(Method):
         return rows.to(self.context.device)
 
 
+_OTHER_OPTIONS = ("unexpected keyword argument", "required keyword-only argument")
+
+
 def make_exploration(context: Context) -> Exploration:
     options = context.options("exploration")
     inputs = (context.spec.observation_dim,)
@@ -357,7 +360,7 @@ def _make(
         with naming(section):
             return kinds[kind](*inputs, **options)
     except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
+        if not any(fault in str(error) for fault in _OTHER_OPTIONS):
             raise
         raise ValueError(
             f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
