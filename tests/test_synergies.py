@@ -11,6 +11,7 @@ from tests.configs import tiny
 from tests.stages import explorer
 from torchrl_etl.analysis import describe_synergies, draw_synergies, variance_accounted_for
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.etl import Explorer
 from torchrl_etl.synergies import (
     SYNERGY_MODELS,
     SynergyModel,
@@ -239,9 +240,11 @@ def test_log_slope_is_the_determinant_against_the_middle_of_the_range(kind: str)
         torch.testing.assert_close(decoder.log_slope(row), found - middle)
 
 
-@pytest.mark.parametrize("setting", ["synergies.kind=nmf", "exploration.kind=metra"])
+@pytest.mark.parametrize(("section", "kind"), [("synergies", "nmf"), ("exploration", "metra")])
 def test_a_kind_with_the_options_of_another_is_refused_with_the_setting_that_helps(
-    setting: str,
+    section: str, kind: str
 ) -> None:
-    with pytest.raises(ValueError, match=rf"choose {setting.replace('.kind', '')}, which brings"):
-        explorer(setting)
+    config = tiny("run_dir=unused")
+    config[section].kind = kind
+    with pytest.raises(ValueError, match=rf"choose {section}={kind}, which brings its own"):
+        Explorer(Experiment(config).context)
