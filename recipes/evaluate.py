@@ -32,7 +32,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError):
+    with one_sentence(ValueError, OSError, ImportError):
         if config.run is None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         size = check_video_size(config.video_size)

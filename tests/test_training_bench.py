@@ -145,6 +145,40 @@ def test_a_mistake_is_told_before_anything_runs(override, words, recipe):
         recipe.queue(config)
 
 
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        ("myoHandPose", ("myoHandPose", "")),
+        ("myoHandPose:random", ("myoHandPose", "random")),
+        ("my_module:MyTask-v0", ("my_module:MyTask-v0", "")),
+        ("my_package.tasks:My/Task-v0", ("my_package.tasks:My/Task-v0", "")),
+        ("my_module:MyTask-v0:random", ("my_module:MyTask-v0", "random")),
+        ("my_module:MyTask-v0:fixed", ("my_module:MyTask-v0", "fixed")),
+    ],
+)
+def test_only_a_goal_s_own_words_are_read_as_the_goal(task, expected, recipe):
+    assert recipe.split_goal(task) == expected
+
+
+def test_a_queue_takes_a_task_of_one_s_own_and_its_random_goal(recipe, tmp_path, monkeypatch):
+    (tmp_path / "queue_tasks.py").write_text(
+        "import gymnasium as gym\n"
+        "entry = 'torchrl_etl.envs.analytic:AnalyticOveractuated'\n"
+        "for env_id in ('QueueReach-v0', 'QueueReachRandom-v0'):\n"
+        "    gym.register(env_id, entry_point=entry, max_episode_steps=25)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    tasks = "queue_tasks:QueueReach-v0,queue_tasks:QueueReachRandom-v0:random"
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("bench", [f"tasks=[{tasks}]", "methods=[sac]", "seeds=[0]"])
+    fixed, random = recipe.queue(config)
+    assert (fixed.task, fixed.goal) == ("queue_tasks:QueueReach-v0", None)
+    assert (random.task, random.goal) == ("queue_tasks:QueueReachRandom-v0", "random")
+    assert "env=queue_tasks:QueueReachRandom-v0" in random.command
+    assert "goal=random" in random.command
+    assert random.path.name == "queue_tasks-QueueReachRandom-v0-random-sac-seed0"
+
+
 def test_a_misspelt_setting_is_answered_with_the_nearest(tmp_path):
     arguments = command(tmp_path / "out", "metods=[sac]")
     ended = subprocess.run(arguments, capture_output=True, text=True, timeout=120)

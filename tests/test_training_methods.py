@@ -15,8 +15,11 @@ from tests.configs import CONF, tiny
 from tests.test_training_resume import numbers
 from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
+from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.sar import finished_episodes, rollouts
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import save_bundle
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
 
@@ -41,11 +44,46 @@ def config(method: str, run: Path, *overrides: str):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_file_names_itself_and_makes_stages(method):
+def test_a_file_names_itself_and_makes_stages(method, tmp_path):
     made = tiny(f"method={method}", "run_dir=unused", ELBOW)
     assert made.method.name == method
-    synergies = min(made.num_synergies, 6)
-    Experiment(tiny(f"method={method}", "run_dir=unused", ELBOW, f"num_synergies={synergies}"))
+    if made.synergies.bundle is not None:  # such as one of benchmarks/body_synergies.py
+        spec = EnvironmentSpec.of(make_env(made.env))
+        bounds = {"low": spec.low.tolist(), "high": spec.high.tolist()}
+        decoder = SynergyDecoder(2, spec.action_dim, hidden=(8,), **bounds)
+        made.synergies.bundle = str(
+            save_bundle(decoder, tmp_path / "bundle", task=made.env, actuators=spec.actuators)
+        )
+    Experiment(made)
+
+
+@pytest.mark.parametrize("method", ["sac", "lattice"])
+def test_methods_without_synergies_take_any_body_and_any_number_of_synergies(method):
+    for number in ("null", "8"):
+        made = tiny(
+            f"method={method}", "env=cheetah-run", f"num_synergies={number}", "run_dir=unused"
+        )
+        Experiment(made).method.stage()
+
+
+def test_etl_takes_half_of_a_small_body_s_actuators_and_says_so():
+    said = []
+    made = Experiment(
+        tiny("env=cheetah-run", "num_synergies=null", "run_dir=unused"), say=said.append
+    )
+    assert made.config.num_synergies == 3
+    assert said == ["num_synergies is 3, as cheetah-run has 6 actuators."]
+
+
+def test_etl_takes_eight_of_a_large_body_s_and_says_nothing():
+    said = []
+    made = Experiment(tiny("num_synergies=null", "run_dir=unused"), say=said.append)
+    assert made.config.num_synergies == 8 and not said  # of 16 actuators
+
+
+def test_etl_refuses_more_synergies_than_actuators():
+    with pytest.raises(ValueError, match="num_synergies is 7 but cheetah-run has 6 actuators"):
+        Experiment(tiny("env=cheetah-run", "num_synergies=7", "run_dir=unused"))
 
 
 # What their public code says, in the project's words.

@@ -51,8 +51,8 @@ def check_action_space(space: spaces.Space, task: str) -> None:
         "no bounds",
         low,
         high,
-        "policies act between finite bounds, so register the task with "
-        "gymnasium.wrappers.RescaleAction or another wrapper that declares some",
+        "policies act between finite bounds, so register the task with a wrapper that declares "
+        "some, such as gymnasium.wrappers.TransformAction with a Box from -1 to 1",
     )
     _refuse(
         ~(low < high),

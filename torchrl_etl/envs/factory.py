@@ -59,7 +59,8 @@ def make_env(
 
     Args:
         name (str): a task of :func:`~torchrl_etl.envs.list_tasks`, ``"overactuated"``, a registered
-            Gymnasium id, or a DMControl ``"domain-task"``.
+            Gymnasium id, ``"module:id"`` for one that ``module`` registers, or a DMControl
+            ``"domain-task"``.
 
     Keyword Args:
         num_envs (int): number of simulators; one gives an environment of batch size ``[]``.
@@ -206,7 +207,7 @@ class _BatchedGymWrapper(GymWrapper):
 
 def _raw_actuator_names(simulation: Any) -> list[str]:
     if hasattr(simulation, "actuator_names"):
-        return list(simulation.actuator_names)
+        return [str(name) for name in simulation.actuator_names]
     if hasattr(simulation, "physics"):
         model = simulation.physics.model
         return [model.id2name(i, "actuator") for i in range(model.nu)]

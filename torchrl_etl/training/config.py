@@ -96,6 +96,9 @@ def validate(config: DictConfig) -> None:
         )
     if config.compile not in (None, True, False):
         raise ValueError(f"compile is {config.compile!r}; it must be true, false or null.")
+    key = config.success_key
+    if key is not None and (not isinstance(key, str) or not key):
+        raise ValueError(f"success_key is {key!r}; it must name an entry of info, or be null.")
     for name in ("frames", "threads", "num_synergies"):
         if config[name] is not None:
             check_integer(1, **{name: config[name]})

@@ -64,6 +64,7 @@ class Context:
         return {
             "goal": self.config.goal,
             "action_repeat": self.config.action_repeat,
+            "success_key": self.config.success_key,
             "env_kwargs": self.options("env_kwargs"),
         }
 
@@ -120,12 +121,13 @@ class Context:
         num_envs = collector.pop("num_envs")
         collector["collector_class"] = VectorCollector if num_envs > 1 else Collector
         collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
+        other = {"goal": None, "success_key": None} if task else {}  # what it says itself
         make_env = partial(
             env_of_a_collector,
             task or self.config.env,
             num_envs=num_envs,
             transforms=tuple(env_transforms),
-            **{**self.variant, **({"goal": None} if task else {}), **(env_options or {})},
+            **{**self.variant, **other, **(env_options or {})},
         )
         configured = self.options(section)
         for key in NOT_OF_THE_STAGE:

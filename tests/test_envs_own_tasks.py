@@ -1,0 +1,154 @@
+"""Tasks that a user registers: found by module, for every process, and refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+import torch
+
+from tests.configs import ROOT
+from torchrl_etl.envs import actuator_names, make_env, resolve_task
+
+REACH = """
+import gymnasium as gym
+import numpy as np
+
+
+class Reach(gym.Env):
+    observation_space = gym.spaces.Box(-10, 10, (2,))
+    action_space = gym.spaces.Box(-1, 1, (4,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = self.np_random.uniform(-1, 1, 2)
+        return self.at.astype(np.float32), {}
+
+    def step(self, action):
+        self.at = np.clip(self.at + 0.1 * (action[:2] - action[2:]), -10, 10)
+        near = bool(np.abs(self.at).max() < 0.2)
+        return self.at.astype(np.float32), -np.abs(self.at).sum(), near, False, {"arrived": near}
+
+
+gym.register("%s", entry_point=Reach, max_episode_steps=20)
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch) -> str:
+    """A task whose module lies in the current folder, and nowhere on the path."""
+    module, env_id = f"own_{tmp_path.name.replace('-', '_')}", "Reach-v0"
+    (tmp_path / f"{module}.py").write_text(REACH % env_id)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield f"{module}:{env_id}"
+    gym.registry.pop(env_id, None)
+    sys.modules.pop(module, None)
+
+
+def recipe(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / name), *overrides],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=240,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def test_a_module_in_the_current_folder_registers_its_task(own):
+    task = resolve_task(own)
+    assert (task.name, task.env_id, task.episode_steps) == (own, "Reach-v0", 20)
+    assert task.goal is None and task.solved_steps is None
+    env = make_env(own, num_envs=2, seed=0)
+    assert env.rollout(3)["action"].shape == (2, 3, 4)
+    assert actuator_names(own) == [f"actuator_{i}" for i in range(4)]
+
+
+def test_an_id_that_the_module_does_not_register_is_one_sentence(own):
+    module = own.partition(":")[0]
+    with pytest.raises(ValueError, match=f"Importing '{module}' registers no task 'Raech-v0'"):
+        resolve_task(f"{module}:Raech-v0")
+
+
+@pytest.mark.parametrize("module", ["no_such_module", "os.no_such", ".relative"])
+def test_a_module_that_is_not_there_is_one_sentence(module):
+    with pytest.raises(ImportError, match=f"There is no module '{module}' for the task"):
+        resolve_task(f"{module}:Reach-v0")
+
+
+def test_what_the_module_itself_lacks_is_told_as_it_is(tmp_path, monkeypatch):
+    (tmp_path / "needs_more.py").write_text("import not_installed_at_all")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="No module named 'not_installed_at_all'"):
+        resolve_task("needs_more:Reach-v0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["single", "process"])
+def test_a_recipe_runs_and_evaluates_a_task_of_one_s_own(collector, own, tmp_path):
+    done = recipe(
+        "etl_sac.py",
+        f"env={own}",
+        "experiment=smoke",
+        "method=sac",
+        f"collector={collector}",
+        "success_key=arrived",
+        "progress=false",
+        "pictures=false",
+        "threads=1",
+        f"run_dir='{tmp_path}/run'",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["env"] == own and summary["goal"] is None
+    assert 0 <= summary["learn"]["solved"]["after"] <= 1
+    done = recipe("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    done = recipe("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=elsewhere)
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert "There is no module" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "goal"),
+    [
+        ("myoElbowPose1D6MRandom-v0", "random"),
+        ("myoElbowPose1D6MFixed-v0", "fixed"),
+        ("myoHandPoseRandom-v0", "random"),
+        ("Pendulum-v1", None),
+        ("myoHandPose", "fixed"),
+    ],
+)
+def test_an_id_says_its_goal(name, goal):
+    task = resolve_task(name)
+    assert task.goal == goal
+    assert task.goal_in_words == (f" ({goal} goal)" if goal else "")
+
+
+def test_a_goal_that_another_id_contradicts_is_refused():
+    with pytest.raises(ValueError, match="names its random goal itself"):
+        resolve_task("myoElbowPose1D6MRandom-v0", "fixed")
+
+
+@pytest.mark.parametrize("name", ["cheetah-run", "Pendulum-v1", "myoElbowPose1D6MRandom-v0"])
+def test_copies_of_an_unseeded_environment_start_apart(name):
+    first, second = make_env(name, num_envs=2).reset()["observation"]
+    alone = make_env(name).reset()["observation"]
+    assert not torch.equal(first, second)
+    assert not torch.equal(first, alone)
+
+
+def test_of_more_actuators_than_the_action_has_entries_the_muscles_are_named():
+    names = actuator_names("myoChallengeOslRunFixed-v0")  # 54 muscles, 2 motors of a prosthesis
+    assert len(names) == len(set(names)) == 54
+    assert not [name for name in names if "osl" in name.lower()]
+    assert all(type(name) is str for name in names)
