@@ -352,7 +352,6 @@ def test_follows_its_module_to_another_precision(kind: dict[str, bool]) -> None:
 class TestLatticeSAC(synergy.TestSynergySACLoss):
     """LeanSACLoss on a Lattice actor passes the check list of losses."""
 
-    vmapped = False
     default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
     trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
     state_dependent = False

@@ -133,11 +133,16 @@ def lattice_scale_tril(weight: Tensor, latent_variance: Tensor, action_variance:
 class _Within(torch.autograd.Function):
     """Bounds whose gradient still passes where it leads back inside."""
 
+    generate_vmap_rule = True
+
     @staticmethod
-    def forward(ctx: Any, value: Tensor, low: float, high: float) -> Tensor:
-        ctx.save_for_backward(value)
-        ctx.bounds = low, high
+    def forward(value: Tensor, low: float, high: float) -> Tensor:
         return value.clamp(low, high)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, float, float], output: Tensor) -> None:
+        value, *ctx.bounds = inputs
+        ctx.save_for_backward(value)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
