@@ -215,6 +215,8 @@ class ETL(Method):
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             self._explore(stop)
         _, info = self.decoder()
+        if not self.given:  # whole batches were collected, a few frames more than the budget
+            self.charged = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
 
     def _explore(self, stop: StopOnSignal) -> None:
