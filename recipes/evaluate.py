@@ -33,9 +33,9 @@ CONF = Path(__file__).parent / "conf"
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with one_sentence(ValueError, OSError, ImportError):
+        size = check_video_size(config.video_size)
         if config.run is None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
-        size = check_video_size(config.video_size)
         run = Path(config.run)
         trained = resumed_config(
             run,
