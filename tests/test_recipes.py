@@ -161,7 +161,6 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("etl_sac.py", "~learn.sac.gama", "did you mean learn.sac.gamma"),
         ("etl_sac.py", "-m", "recipes/bench.py"),
         ("bench.py", "--multirun", "recipes/bench.py"),
-        ("etl_sac.py", "+env_kwargs.gravity=0", "does not take env_kwargs={'gravity': 0}"),
         ("evaluate.py", "video_size=[480,641]", "two even whole numbers"),
         ("evaluate.py", "video_size=480", "two even whole numbers"),
         ("evaluate.py", "video_size=[0,0]", "two even whole numbers"),

@@ -87,6 +87,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("device=null", "device is None; it must be a text"),
         ("device=meta", "device is 'meta'; use cpu"),
         ("env=3", "env is 3; it must be a text"),
+        ("env=Pendulum-v1 +env_kwargs.gravity=0", "does not take env_kwargs={'gravity': 0}"),
         ("log=tensorboard", "log is 'tensorboard'; it must be a list"),
         ("log=[wandb]", "pip install wandb"),
         ("stage=learn", "stage=learn needs synergies=PATH"),
