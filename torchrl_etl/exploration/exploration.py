@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -21,19 +20,17 @@ class Exploration:
 
     This one is SAC on the task's reward, without anything added. Others override what differs, in
     a file of their own, and put themselves into
-    :data:`~torchrl_etl.exploration.EXPLORATIONS` (see ``docs/extend.md``).
+    :data:`~torchrl_etl.exploration.EXPLORATIONS`.
 
     Attributes:
         reward (NestedKey): what SAC learns on in stage 1, below ``"next"``.
         keep (sequence of NestedKey): entries of a transition that the buffer must keep for it.
         inputs (mapping): sizes of what actor and critics read beside the observation, by key.
-        learns (bool): whether a policy is trained at all.
     """
 
     reward: NestedKey = "reward"
     keep: Sequence[NestedKey] = ()
     inputs: Mapping[str, int]
-    learns: ClassVar[bool] = True
 
     def __init__(self) -> None:
         self.inputs = {}

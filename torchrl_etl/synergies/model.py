@@ -18,7 +18,7 @@ class SynergyModel(ABC):
     """Condenses actions of n actuators into d coefficients.
 
     A subclass is a file of its own and an entry of
-    :data:`~torchrl_etl.synergies.SYNERGY_MODELS` (see ``docs/extend.md``). It is built from the
+    :data:`~torchrl_etl.synergies.SYNERGY_MODELS`. It is built from the
     bounds of the action: ``Model(low, high, num_synergies, **options)``.
 
     Attributes:
