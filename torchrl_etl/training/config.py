@@ -66,9 +66,13 @@ MAY_CHANGE = (
     *(
         f"{stage}.{key}"
         for stage in ("explore", "learn")
-        for key in ("frames", "batch_size", "replay_ratio", "buffer_size", "buffer_storage")
+        for key in (
+            *("frames", "batch_size", "replay_ratio", "learning_starts"),
+            *("buffer_size", "buffer_storage"),
+        )
     ),
     *("learn.sac.lr", "learn.sac.lr_end", "learn.decoder.lr", "explore.sac.lr"),
+    "explore.fit.final_updates",
 )
 """Settings and sections that a resumed run may have otherwise than its checkpoints."""
 
