@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -103,3 +105,86 @@ def test_the_size_of_a_checkpoint_counts_every_tensor():
     filled = buffer(10)
     filled.extend(rows(0, 3))
     assert _size(filled) >= 4 * 3 * 2
+
+
+def module(value: float) -> torch.nn.Linear:
+    linear = torch.nn.Linear(3, 2)
+    torch.nn.init.constant_(linear.weight, value)
+    return linear
+
+
+def change(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def tensors(folder: Path) -> Path:
+    return next(path for path in sorted(folder.rglob("*.memmap")) if path.stat().st_size)
+
+
+def description(folder: Path) -> Path:
+    return next(path for path in sorted(folder.rglob("*.json")) if path.name != "seal.json")
+
+
+def replace_by_file(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.write_text("a file")
+
+
+DAMAGE = {
+    "a bit of a tensor": lambda folder: change(tensors(folder)),
+    "a bit of a description": lambda folder: change(description(folder)),
+    "a tensor cut short": lambda folder: os.truncate(tensors(folder), 1),
+    "an empty tensor": lambda folder: os.truncate(tensors(folder), 0),
+    "no tensor": lambda folder: tensors(folder).unlink(),
+    "no description": lambda folder: description(folder).unlink(),
+    "no files": lambda folder: [shutil.rmtree(folder), folder.mkdir()],
+    "a file more": lambda folder: (folder / "more.json").write_text("{}"),
+    "a file in its place": replace_by_file,
+    "no seal": lambda folder: (folder / "seal.json").unlink(),
+    "an empty seal": lambda folder: (folder / "seal.json").write_text(""),
+    "a seal of nothing": lambda folder: (folder / "seal.json").write_text("{}"),
+    "a seal that is a list": lambda folder: (folder / "seal.json").write_text("[1]"),
+    "a seal in no encoding": lambda folder: (folder / "seal.json").write_bytes(b"\xff\xfe\x00"),
+}
+
+
+@pytest.fixture
+def saved(tmp_path) -> Checkpoints:
+    """Two checkpoints of a layer, whose weights were 1 and then 2."""
+    checkpoints = Checkpoints(tmp_path / "saved", keep_last=2)
+    for step in (1, 2):
+        checkpoints.save(Checkpoint(module=module(step)), step=step)
+    return checkpoints
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_whatever_is_damaged_in_the_newest_checkpoint_the_one_before_is_taken(kind, saved):
+    second = saved.checkpoints()[-1]
+    DAMAGE[kind](second)
+    layer = module(0)
+    with pytest.warns(UserWarning, match=f"{second} is damaged .*; falling back to the one before"):
+        assert saved.load_newest_whole(Checkpoint(module=layer))
+    assert (layer.weight == 1).all()
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_whatever_is_damaged_in_all_checkpoints_they_are_refused_and_stay(kind, saved):
+    for folder in saved.checkpoints():
+        DAMAGE[kind](folder)
+    layer = module(0)
+    with (
+        pytest.warns(UserWarning, match="is damaged"),
+        pytest.raises(OSError, match=r"All checkpoints in .* are damaged") as caught,
+    ):
+        saved.load_newest_whole(Checkpoint(module=layer))
+    assert "\n" not in str(caught.value)
+    assert (layer.weight == 0).all() and len(saved.checkpoints()) == 2
+
+
+def test_without_damage_the_newest_is_taken_without_a_word(saved, recwarn):
+    layer = module(0)
+    assert saved.load_newest_whole(Checkpoint(module=layer))
+    assert (layer.weight == 2).all()
+    assert not [warning for warning in recwarn if "damaged" in str(warning.message)]

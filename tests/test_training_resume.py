@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from tests.configs import ROOT, TINY, tiny
+from tests.runs import killed_when_saved, numbers
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
@@ -27,7 +28,6 @@ from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
 
-WALL_CLOCK = ("frames_per_second", "wall_seconds")
 # With all that remembers what was seen, or goes by the frames.
 REMEMBERS = (
     "learn.sac.normalize_observations=true",
@@ -35,20 +35,6 @@ REMEMBERS = (
     "learn.sac.lr_end=0.5",
     "learn.sac.ema_decay=0.9",
 )
-
-
-def numbers(run: Path) -> dict[str, str]:
-    """Everything a run logged and concluded, but for the time it took."""
-    scalars = {
-        path.relative_to(run).as_posix(): path.read_text()
-        for path in sorted((run / "csv").rglob("*.csv"))
-        if path.stem not in WALL_CLOCK
-    }
-    summary = json.loads((run / "summary.json").read_text())
-    for section in (summary, summary.get("synergies", {})):
-        for key in ("versions", "commit"):
-            section.pop(key, None)
-    return {**scalars, "summary": json.dumps(summary)}
 
 
 def command(run: Path, *overrides: str) -> list[str]:
@@ -145,9 +131,7 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrup
     assert numbers(run) == uninterrupted
 
 
-def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numbers(
-    tmp_path, monkeypatch
-):
+def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numbers(tmp_path):
     learner = (
         *("method=sac", "actor.body=residual", "learn.critic.bins=11", "learn.noise.kind=held"),
         *("learn.sac.return_bound=5", "learn.replay_ratio=0.5", "frames=608"),
@@ -155,16 +139,7 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     Experiment(tiny(f"run_dir='{whole}'", *learner)).run()
 
-    save = Checkpoints.save
-
-    def save_and_die(self, checkpoint, *, step, **kwargs):
-        save(self, checkpoint, step=step, **kwargs)
-        raise ZeroDivisionError("as good as killed")
-
-    monkeypatch.setattr(Checkpoints, "save", save_and_die)
-    with pytest.raises(ZeroDivisionError):
-        Experiment(tiny(f"run_dir='{broken}'", *learner)).run()
-    monkeypatch.undo()
+    killed_when_saved(broken, 320, *learner)
     summary = Experiment(resumed_config(broken), resume=broken).run()
     assert "synergies" not in summary and summary["learn"]["frames_charged"] == 608
     assert numbers(broken) == numbers(whole)
@@ -226,7 +201,7 @@ def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_pa
         seal.write_text("{}")
     with (
         pytest.warns(UserWarning, match="is damaged"),
-        pytest.raises(OSError, match="move that folder away"),
+        pytest.raises(OSError, match="or start a new run"),
     ):
         Experiment(resumed_config(run), resume=run).run()
 
@@ -299,7 +274,7 @@ def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path):
     experiment.run()
     file = experiment.folder.explored
     file.rename(f"{file}.away")
-    with pytest.raises(FileNotFoundError, match="is gone, and stage 2 begins with"):
+    with pytest.raises(OSError, match="is gone, and stage 2 begins with"):
         Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
     Path(f"{file}.away").rename(file)
     Experiment(resumed_config(run, ["stage=all"]), resume=run).run()

@@ -317,12 +317,15 @@ class ETL(Method):
     def _explored(self, decoder: SynergyDecoder) -> TensorDict:
         """The transitions that stage 1 left; where there is a residual, theirs is zero."""
         file = self.context.folder.explored
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"{file} is gone, and stage 2 begins with the transitions in it; start a new run, "
-                f"with synergies={self.context.folder.path} if it shall have the same synergies."
-            )
-        tensors = safetensors.torch.load(file.read_bytes())
+        try:
+            tensors = safetensors.torch.load(file.read_bytes())
+        except (FileNotFoundError, safetensors.SafetensorError) as error:
+            fault = "gone" if isinstance(error, FileNotFoundError) else f"damaged ({error})"
+            raise OSError(
+                f"{file} is {fault}, and stage 2 begins with the transitions in it; start a new "
+                f"run, with synergies={self.context.folder.path} if it shall have the same "
+                "synergies."
+            ) from error
         rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
         missing = decoder.synergy_dim - rows["synergy"].shape[-1]
         rows["synergy"] = nn.functional.pad(rows["synergy"], (0, missing))

@@ -95,8 +95,8 @@ class Checkpoints(CheckpointRotation):
                 ) from error
         elif self.checkpoints():
             raise OSError(
-                f"All checkpoints in {self.directory} are damaged; move that folder away to begin "
-                "this stage anew."
+                f"All checkpoints in {self.directory} are damaged; copy them from a backup of the "
+                "run, or start a new run."
             )
         return folder is not None
 

@@ -105,7 +105,7 @@ def run_stage(
     checkpoints = Checkpoints(folder.checkpoints(stage.name), keep_last=keep)
     resumed = checkpoints.load_newest_whole(stage.checkpoint())
     if not resumed:
-        _refuse_lost_checkpoints(stage, folder, checkpoint_every, offset)
+        _refuse_lost_checkpoints(stage, folder)
     # A fresh start also forgets the row of frame 0 that a run killed before saving may have left.
     folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
     if stage.finished:
@@ -138,6 +138,7 @@ def run_stage(
                 report.evaluation(last := evaluate())
             if _passed(before, stage.frames, checkpoint_every) or stage.finished or stop.requested:
                 checkpoints.save(stage.checkpoint(), step=stage.frames)
+                folder.remember_saved(stage.name, stage.frames)
                 if stop.requested and not stage.finished:
                     raise Interrupted
                 if not stage.finished:
@@ -149,17 +150,13 @@ def run_stage(
     return last
 
 
-def _refuse_lost_checkpoints(
-    stage: Stage, folder: RunFolder, checkpoint_every: int, offset: int
-) -> None:
+def _refuse_lost_checkpoints(stage: Stage, folder: RunFolder) -> None:
     """Keep the rows of a stage that was saved once and has no checkpoint any more."""
-    frames = [frame - offset for frame in folder.series(f"{stage.name}/updates")[0]]
-    # A row is written before the checkpoint of its frame, so the row after it proves that one.
-    if len([frame for frame in frames if frame >= checkpoint_every]) > 1:
+    if stage.name in (saved := folder.saved):
         raise OSError(
-            f"{folder.path} has logged {frames[-1]} frames of stage {stage.name!r} and holds none "
-            f"of its checkpoints; copy checkpoints/{stage.name} back, or move "
-            f"csv/scalars/{stage.name} away to begin this stage anew."
+            f"{folder.path} was saved at frame {saved[stage.name]} of stage {stage.name!r} and "
+            f"holds none of its checkpoints; copy checkpoints/{stage.name} back, or start a new "
+            "run."
         )
 
 

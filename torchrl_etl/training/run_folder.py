@@ -77,9 +77,7 @@ class RunFolder:
                 "run_dir or mend its permissions."
             ) from error
         # One entry a start: a run may be resumed on another machine or commit.
-        versions = self.path / "versions.json"
-        before = json.loads(versions.read_text()) if versions.exists() else []
-        self.write_json("versions.json", [*before, facts()])
+        self.write_json("versions.json", [*self._read_json("versions.json", []), facts()])
 
     def close(self) -> None:
         """Let other processes have the folder."""
@@ -104,6 +102,15 @@ class RunFolder:
 
     def checkpoints(self, stage: str) -> Path:
         return self.path / "checkpoints" / stage
+
+    @property
+    def saved(self) -> dict[str, int]:
+        """Frames of each stage at its last checkpoint, known also where that is gone since."""
+        return self._read_json("saved.json", {})
+
+    def remember_saved(self, stage: str, frames: int) -> None:
+        """Note that ``stage`` has a checkpoint, for :attr:`saved`."""
+        self.write_json("saved.json", {**self.saved, stage: frames})
 
     @property
     def synergies(self) -> Path:
@@ -164,10 +171,20 @@ class RunFolder:
         config = OmegaConf.to_container(self._config, resolve=True)
         if name == "trackio":  # knows a run again by its name
             return {"config": config}
-        known = self.path / "wandb.json"
-        if not known.exists():
-            self.write_json(known.name, {"id": uuid.uuid4().hex})
-        return {"config": config, "id": json.loads(known.read_text())["id"]}
+        if not (known := self._read_json("wandb.json", {})):
+            self.write_json("wandb.json", known := {"id": uuid.uuid4().hex})
+        return {"config": config, "id": known["id"]}
+
+    def _read_json(self, name: str, default: Any) -> Any:
+        """What :meth:`write_json` wrote; a value of the same type as ``default``, if none."""
+        path = self.path / name
+        try:
+            content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else default
+        except ValueError:
+            content = None
+        if not isinstance(content, type(default)):
+            raise OSError(f"{path} is damaged; move it away to go on without it.")
+        return content
 
 
 def _claimed(path: Path) -> Path:
@@ -229,10 +246,12 @@ def _commit() -> str | None:
 
 
 def _read(path: Path) -> list[tuple[int, float]]:
-    """Whole rows of a scalar file; a row that was being written at a crash is dropped."""
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        frame, separator, value = line.partition(",")
-        if separator and value:
-            rows.append((int(frame), float(value)))
-    return rows
+    """Whole rows of a scalar file; the one that is being written, or was at a crash, is not."""
+    try:
+        whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
+        rows = [line.split(",") for line in whole.splitlines()]
+        return [(int(frame), float(value)) for frame, value in rows]
+    except ValueError as error:
+        raise OSError(
+            f"{path} is damaged ({error}); move it away to go on without what it logged."
+        ) from error

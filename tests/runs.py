@@ -1,0 +1,44 @@
+"""What tests of whole runs compare, and how they end one before its time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from pytest import MonkeyPatch
+
+from tests.configs import tiny
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.training.run_folder import RunFolder
+
+WALL_CLOCK = ("frames_per_second", "wall_seconds")
+
+
+def numbers(run: Path) -> dict[str, str]:
+    """Everything a run logged and concluded, but for the time it took."""
+    scalars = {
+        path.relative_to(run).as_posix(): path.read_text()
+        for path in sorted((run / "csv").rglob("*.csv"))
+        if path.stem not in WALL_CLOCK
+    }
+    summary = json.loads((run / "summary.json").read_text())
+    for section in (summary, summary.get("synergies", {})):
+        for key in ("versions", "commit"):
+            section.pop(key, None)
+    return {**scalars, "summary": json.dumps(summary)}
+
+
+def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
+    """A tiny run that ends, as if killed, when its checkpoint of so many frames is finished."""
+
+    def remember_and_die(self, stage, saved):
+        remember(self, stage, saved)
+        if saved == frames:
+            raise ZeroDivisionError("as good as killed")
+
+    remember = RunFolder.remember_saved
+    with MonkeyPatch.context() as patch:
+        patch.setattr(RunFolder, "remember_saved", remember_and_die)
+        with pytest.raises(ZeroDivisionError):
+            Experiment(tiny(f"run_dir='{run}'", *overrides)).run()

@@ -1,0 +1,224 @@
+"""A run holds all that it needs, and what is lost or damaged in its folder is one sentence."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.configs import tiny
+from tests.runs import killed_when_saved, numbers
+from torchrl_etl.envs import SimulationError
+from torchrl_etl.envs.analytic import AnalyticOveractuated
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.training import Interrupted, resumed_config
+from torchrl_etl.training.stage import Stage
+
+ONLY_AT_THE_END = "checkpoint.every=100000"
+
+
+def rows(run: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (run / "csv").rglob("*.csv")}
+
+
+def resume(run: Path, *overrides: str) -> dict:
+    return Experiment(resumed_config(run, overrides), resume=run).run()
+
+
+@pytest.fixture
+def bundle(tmp_path) -> Path:
+    decoder, names = SynergyDecoder(2, 16, hidden=(32, 32)), [f"muscle_{i}" for i in range(16)]
+    return save_bundle(decoder, tmp_path / "other", task="overactuated", actuators=names)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("finished") / "run"
+    Experiment(tiny(f"run_dir='{run}'", "learn.prefill=true")).run()
+    return run
+
+
+@pytest.fixture
+def copy(finished, tmp_path) -> Path:
+    """A finished run, copied elsewhere."""
+    return Path(shutil.copytree(finished, tmp_path / "copy"))
+
+
+# Checkpoints ---------------------------------------------------------------------------------
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_refused_and_its_rows_stay(copy):
+    before = rows(copy)
+    for checkpoint in (copy / "checkpoints" / "learn").iterdir():
+        next(checkpoint.rglob("*.memmap")).unlink()
+    with (
+        pytest.warns(UserWarning, match="is damaged") as caught,
+        pytest.raises(OSError, match=r"All checkpoints in .*learn are damaged; copy them from"),
+    ):
+        resume(copy)
+    assert sum("is damaged" in str(warning.message) for warning in caught) == 2
+    assert rows(copy) == before
+
+
+def test_a_finished_run_copied_without_checkpoints_is_refused_and_its_rows_stay(copy):
+    before = rows(copy)
+    shutil.rmtree(copy / "checkpoints")
+    with pytest.raises(OSError, match=r"at frame 608 of stage 'learn' and .*; copy check"):
+        resume(copy)
+    assert rows(copy) == before
+
+
+@pytest.mark.parametrize(("method", "stage"), [("etl", "explore"), ("sac", "learn")])
+def test_so_is_one_whose_last_checkpoint_was_its_first(method, stage, tmp_path):
+    run = tmp_path / "run"
+    killed_when_saved(run, 608, f"method={method}", ONLY_AT_THE_END)
+    before = rows(run)
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(OSError, match=f"at frame 608 of stage '{stage}' and holds none"):
+        resume(run)
+    assert before and rows(run) == before
+
+
+def test_so_is_one_that_was_stopped_before_its_first_checkpoint_was_due(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    collect = Stage.collect
+
+    def collect_and_signal(stage):
+        batch = collect(stage)
+        if stage.frames == 224:
+            os.kill(os.getpid(), signal.SIGINT)
+        return batch
+
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(Stage, "collect", collect_and_signal)
+        Experiment(tiny(f"run_dir='{run}'", ONLY_AT_THE_END)).run()
+    before = rows(run)
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(OSError, match="at frame 224 of stage 'explore' and holds none"):
+        resume(run)
+    assert before and rows(run) == before
+
+
+def test_stage_2_needs_no_checkpoint_of_a_stage_1_that_is_over(copy):
+    shutil.rmtree(copy / "checkpoints" / "explore")
+    assert resume(copy, "learn.frames=640")["learn"]["frames"] == 640
+
+
+# Other files ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["versions.json", "saved.json", "csv/scalars/learn/updates.csv"])
+@pytest.mark.parametrize("content", [b"\xff\x00\n", b"{\n", b'"text"\n'])
+def test_a_damaged_file_is_named_and_the_run_goes_on_without_it(name, content, copy):
+    file = copy / name
+    file.write_bytes(content)
+    # Only a run without checkpoints asks what was saved.
+    away = copy / "checkpoints" / "learn"
+    if name == "saved.json":
+        away.rename(copy / "away")
+    with pytest.raises(OSError, match=f"{file.name} is damaged.*; move it away"):
+        resume(copy)
+    if name == "saved.json":
+        (copy / "away").rename(away)
+    file.unlink()
+    assert resume(copy)["learn"]["frames"] == 608
+
+
+def test_a_row_that_was_being_written_at_a_crash_is_dropped(copy):
+    file = copy / "csv/scalars/learn/updates.csv"
+    whole = file.read_text()
+    file.write_text(f"{whole}2000,1e")
+    resume(copy)
+    assert file.read_text() == whole
+
+
+def test_damaged_transitions_of_stage_1_are_named(copy):
+    shutil.rmtree(copy / "checkpoints" / "learn")
+    (copy / "saved.json").unlink()
+    (copy / "explored.safetensors").write_bytes(b"no tensors")
+    with pytest.raises(OSError, match=r"explored\.safetensors is damaged .*; start a new run"):
+        resume(copy)
+
+
+# Synergies from elsewhere --------------------------------------------------------------------
+
+
+def test_a_run_is_evaluated_and_goes_on_where_others_synergies_are_gone_and_it_was_moved(
+    bundle, tmp_path
+):
+    whole, run, moved = (tmp_path / name for name in ("whole", "run", "moved"))
+    Experiment(tiny(f"run_dir='{whole}'", f"synergies='{bundle}'")).run()
+    killed_when_saved(run, 320, f"synergies='{bundle}'")
+    shutil.rmtree(bundle)
+    run.rename(moved)
+
+    experiment = Experiment(resumed_config(moved), resume=moved)
+    assert experiment.evaluator(experiment.learned())().summary()["return"]["mean"] < 0
+    resume(moved)
+    assert numbers(moved) == numbers(whole)
+
+
+def test_a_run_that_lost_its_synergies_too_says_where_they_belong(bundle, tmp_path):
+    run = tmp_path / "run"
+    killed_when_saved(run, 320, f"synergies='{bundle}'")
+    kept = tmp_path / "kept"
+    (run / "synergies").rename(kept)
+    shutil.rmtree(bundle)
+    with pytest.raises(FileNotFoundError, match=f"is gone; copy that bundle to {run}/synergies"):
+        resumed = resumed_config(run)
+        Experiment(resumed, resume=run)
+    kept.rename(run / "synergies")
+    assert resume(run)["learn"]["frames"] == 608
+
+
+# Budgets and simulators ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("begun_with", ["frames", "learn.frames"])
+@pytest.mark.parametrize("longer", ["frames", "learn.frames"])
+def test_the_budget_given_on_resume_counts_whichever_setting_gave_the_first(
+    begun_with, longer, tmp_path
+):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'", "method=sac", f"{begun_with}=320")).run()
+    assert resume(run, f"{longer}=640")["learn"]["frames"] == 640
+    assert resume(run)["learn"]["frames"] == 640, "it is the budget from now on"
+
+
+def test_a_simulation_that_diverges_at_every_resume_goes_on_with_another_restart_seed(
+    tmp_path, monkeypatch
+):
+    seeds, deadly = [], set()
+    reset, step = AnalyticOveractuated.reset, AnalyticOveractuated.step
+
+    def noted(env, *, seed=None, options=None):
+        if seed is not None:
+            seeds.extend([seed] if seed >= 2**30 else [])  # none of an evaluation
+            env.diverges = seed in deadly
+        return reset(env, seed=seed, options=options)
+
+    def diverging(env, action):
+        observation, *rest = step(env, action)
+        return (observation * np.nan if env.diverges else observation), *rest
+
+    monkeypatch.setattr(AnalyticOveractuated, "reset", noted)
+    monkeypatch.setattr(AnalyticOveractuated, "step", diverging)
+    control = ("method=sac", "frames=608")
+    Experiment(tiny(f"run_dir='{tmp_path}/whole'", *control)).run()
+    deadly.add(seeds[-1])  # of the episodes that begin after the checkpoint of frame 320
+
+    run = tmp_path / "run"
+    with pytest.raises(SimulationError, match="go on with resume=RUN restart_seed=1"):
+        Experiment(tiny(f"run_dir='{run}'", *control)).run()
+    with pytest.raises(SimulationError):
+        resume(run)
+    up_to_320 = numbers(tmp_path / "whole")["csv/scalars/learn/updates.csv"].split("416")[0]
+    assert resume(run, "restart_seed=1")["learn"]["frames"] == 608
+    assert numbers(run)["csv/scalars/learn/updates.csv"].startswith(up_to_320)
+    assert numbers(run) != numbers(tmp_path / "whole")
