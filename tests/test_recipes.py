@@ -159,6 +159,12 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("etl_sac.py", "++runs_dir=a", "did you mean run_dir"),
         ("etl_sac.py", "+new=1", "there is no setting 'new'"),
         ("etl_sac.py", "~learn.sac.gama", "did you mean learn.sac.gamma"),
+        ("etl_sac.py", "~learn.frames", "~learn.frames would take a setting away"),
+        ("etl_sac.py", "~synergies", "~synergies would take a setting away"),
+        ("etl_sac.py", "+log_every=5", "+log_every is a setting that is there already"),
+        ("etl_sac.py", "learn.frames=[1", "'learn.frames=[1' is not of the form key=value"),
+        ("etl_sac.py", "exploration=null", "choose one of metra, metric"),
+        ("etl_sac.py", "learn.anchor=0.1", "is called learn.decoder.distillation_weight now."),
         ("etl_sac.py", "-m", "recipes/bench.py"),
         ("bench.py", "--multirun", "recipes/bench.py"),
         ("evaluate.py", "video_size=[480,641]", "two even whole numbers"),
@@ -177,6 +183,13 @@ def test_a_typo_gets_the_nearest_right_word_and_no_traceback(recipe, override, w
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_former_presets_and_null_still_mean_the_defaults(tmp_path):
+    former = ("learner=residual", "experiment=laptop", "faithful=null", "env=myoHandPos")
+    done = run("etl_sac.py", *former, cwd=tmp_path)
+    assert "myoHandPose" in done.stderr, "only the task is wrong"
+    assert "Traceback" not in done.stderr
 
 
 def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from tests.configs import CONF, tiny
+from torchrl_etl.command_line import translate
 from torchrl_etl.envs import list_tasks
 from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
+from torchrl_etl.training.config import RENAMED
 from torchrl_etl.training.run_folder import RunFolder
 
 GROUPS = {
@@ -199,3 +203,92 @@ def test_arguments_reach_the_simulator(tmp_path):
     config = tiny("env=Pendulum-v1", "+env_kwargs.g=0.0", f"run_dir='{tmp_path}/run'")
     experiment = Experiment(OmegaConf.merge(config, {"num_synergies": 1}))
     assert simulator(experiment.context.make_env()).g == 0.0
+
+
+# Bodies in bfloat16 ----------------------------------------------------------------------------
+
+
+def said(monkeypatch, tmp_path, capabilities: dict[str, bool], *overrides: str) -> list[str]:
+    lines = []
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    config = tiny(f"run_dir='{tmp_path}/run'", "method=sac", *overrides)
+    Experiment(config, say=lines.append)
+    return [line for line in lines if "bfloat16" in line]
+
+
+@pytest.mark.parametrize("network", ["actor", "critic"])
+def test_bfloat16_on_a_processor_without_instructions_for_it_is_told(
+    network, monkeypatch, tmp_path
+):
+    without = {"avx2": True, "avx512_f": True, "avx512_bf16": False}
+    asked = f"{network}.body=residual_bfloat16"
+    assert said(monkeypatch, tmp_path, without, asked) == [
+        "Warning: this processor has no instructions for bfloat16, so body=residual_bfloat16 takes "
+        "longer than the same in float32, body=residual."
+    ]
+
+
+@pytest.mark.parametrize("name", ["avx512_bf16", "amx_bf16", "bf16", "sve_bf16"])
+def test_bfloat16_on_a_processor_with_instructions_for_it_needs_no_words(
+    name, monkeypatch, tmp_path
+):
+    assert not said(monkeypatch, tmp_path, {name: True}, "actor.body=residual_bfloat16")
+
+
+def test_float32_needs_no_words(monkeypatch, tmp_path):
+    assert not said(monkeypatch, tmp_path, {}, "actor.body=residual")
+
+
+@pytest.mark.parametrize(
+    "preset",
+    [
+        "env=overactuated",
+        *(
+            f"{group}={path.stem}"
+            for group in ("experiment", "faithful", "learner", "method")
+            for path in sorted((CONF / group).glob("*.yaml"))
+        ),
+    ],
+)
+def test_no_preset_chooses_bfloat16(preset):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[preset, "run_dir=unused"])
+    assert "bfloat16" not in OmegaConf.to_yaml(config, resolve=True)
+
+
+# Former and short ways to write a setting --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("learn.anchor=0.1", "learn.anchor is called learn.decoder.distillation_weight now."),
+        ("+learn.anchor=0.1", "learn.anchor is called learn.decoder.distillation_weight now."),
+        ("explore.gmvae.hidden=[8]", "explore.gmvae.hidden is called synergies.hidden now."),
+        ("learn.sac.n_steps=3", "learn.sac.n_steps is called learn.n_steps now."),
+    ],
+)
+def test_a_renamed_setting_is_answered_with_its_name_of_now(argument, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        translate([argument], CONF)
+
+
+@pytest.mark.parametrize("now", sorted(set(RENAMED.values())))
+def test_every_name_of_now_is_one_that_exists(now):
+    key = now.partition("=")[0]
+    configs = tiny(), tiny("exploration=metra")
+    assert any(OmegaConf.select(config, key) is not None for config in configs)
+
+
+def test_former_presets_and_paths_and_kinds_compose():
+    former = ("learner=residual", "experiment=laptop", "faithful=default", "synergies=some/run")
+    null = ("learner=null", "experiment=null", "faithful=null", "synergies=some/run")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=translate([*former, "run_dir=unused"], CONF))
+        as_null = compose("config", overrides=translate([*null, "run_dir=unused"], CONF))
+        same = compose("config", overrides=["synergies.bundle=some/run", "run_dir=unused"])
+        kinds = translate(["synergies.kind=nmf", "exploration.kind=metra"], CONF)
+        others = compose("config", overrides=[*kinds, "run_dir=unused"])
+    assert config == as_null == same
+    assert (others.synergies.kind, others.exploration.kind) == ("nmf", "metra")
+    assert "hidden" not in others.synergies, "it brings its kind's settings"

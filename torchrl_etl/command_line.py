@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.training.config import RENAMED
+from torchrl_etl.training.resumed import check_prefix, parse_override
 
 __all__ = [
     "check_overrides",
@@ -26,6 +27,13 @@ __all__ = [
 
 # Sections whose keys are arguments of someone else's function.
 _OPEN = ("env_kwargs.", "logger_kwargs.", "ray.", "distributed.")
+
+# What stands for the defaults in a group of presets, now and before.
+_NO_PRESET = {
+    "learner": ("null", "residual"),
+    "experiment": ("null", "laptop"),
+    "faithful": ("null", "default"),
+}
 
 
 def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
@@ -71,8 +79,9 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
             near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
-        if choices.get(key) and value != "null":
-            with one_sentence(ValueError):
+        with one_sentence(ValueError):
+            check_prefix(parse_override(argument), key in known)
+            if choices.get(key):
                 check_choice(key, value, choices[key])
 
 
@@ -81,7 +90,8 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
 
     ``synergies=PATH`` is ``synergies.bundle=PATH`` unless it names a kind, ``KIND`` of
     ``synergies.kind=KIND`` and ``exploration.kind=KIND`` brings that kind's other settings, and the
-    presets that hold today's defaults are no preset.
+    presets that hold today's defaults are no preset: they are left out, as ``null`` is, which Hydra
+    does not take for a group.
 
     Args:
         arguments (sequence of str): the command line without the program.
@@ -93,7 +103,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
     Examples:
         >>> groups = Path("recipes/conf")
         >>> translate(["synergies=runs/a", "exploration.kind=metra", "learner=residual"], groups)
-        ['synergies.bundle=runs/a', 'exploration=metra', 'learner=null']
+        ['synergies.bundle=runs/a', 'exploration=metra']
         >>> translate(["learn.anchor=0.2"], groups)
         Traceback (most recent call last):
         ...
@@ -108,10 +118,10 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         kinds = {path.stem for path in (groups / "synergies").glob("*.yaml")}
         if name in ("synergies.kind", "exploration.kind"):
             key = name.removesuffix(".kind")
-        elif name == "synergies" and value not in kinds:
+        elif name == "synergies" and equals and value not in kinds:
             key = "synergies.bundle"
-        elif argument in ("learner=residual", "experiment=laptop", "faithful=default"):
-            value = "null"
+        elif value in _NO_PRESET.get(name, ()):
+            continue
         translated.append(f"{key}{equals}{value}")
     return translated
 

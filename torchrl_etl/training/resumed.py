@@ -17,8 +17,10 @@ from yaml import YAMLError
 
 from torchrl_etl.training.config import MAY_CHANGE, RENAMED
 
-__all__ = ["resumed_config"]
+__all__ = ["check_prefix", "parse_override", "resumed_config"]
 
+# Every release had these, and the last of them ends the file: one that was cut short lacks it.
+_SECTIONS = ("explore", "learn", "checkpoint", "collector", "method")
 # Where settings of other libraries go, by names that are not ours.
 _OPEN_SECTIONS = ("logger_kwargs", "env_kwargs", "ray", "distributed")
 
@@ -45,10 +47,7 @@ def resumed_config(
     for key, value in newer.items():
         OmegaConf.update(config, key, value, force_add=True)
     given = [override for override in overrides if not override.startswith("resume=")]
-    try:
-        parsed = OverridesParser.create().parse_overrides(given)
-    except HydraException as error:
-        raise ValueError(f"{error}".splitlines()[0]) from error
+    parsed = [parse_override(override) for override in given]
     for override in parsed:
         _override(config, override, newer)
     keys = {override.key_or_group for override in parsed}
@@ -65,6 +64,32 @@ def resumed_config(
     return config
 
 
+def parse_override(override: str) -> Override:
+    """What Hydra reads in an argument.
+
+    Raises:
+        ValueError: in one sentence, if it cannot be read.
+    """
+    try:
+        return OverridesParser.create().parse_override(override)
+    except HydraException as error:
+        reason = f"{error}".splitlines()[0]
+        raise ValueError(f"{override!r} is not of the form key=value ({reason}).") from error
+
+
+def check_prefix(override: Override, known: bool) -> None:
+    """Refuse to take settings away, and to add one that is there already.
+
+    Raises:
+        ValueError: if the override would.
+    """
+    key = override.key_or_group
+    if override.is_delete():
+        raise ValueError(f"~{key} would take a setting away, which a run needs; give it a value.")
+    if known and override.is_add() and not override.is_force_add():
+        raise ValueError(f"+{key} is a setting that is there already; leave the plus out.")
+
+
 def _stored(path: Path) -> DictConfig:
     if not path.is_file():
         raise ValueError(
@@ -76,14 +101,7 @@ def _stored(path: Path) -> DictConfig:
         fault = None
     except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
         config, fault = None, " ".join(str(error).split())
-    if fault is None and not isinstance(config, DictConfig):
-        fault = "it holds no settings"
-    if fault is None:
-        # Every release had these, and they come last in the file, or make a run what it is.
-        lost = [
-            key for key in ("env", "seed", "explore", "learn", "checkpoint") if key not in config
-        ]
-        fault = f"it lacks {', '.join(lost)}" if lost else None
+    fault = fault or _lacks(config)
     if fault is None and (old := [k for k in RENAMED if OmegaConf.select(config, k) is not None]):
         raise ValueError(
             f"{path} is of a release whose settings had other names ({old[0]}, now "
@@ -94,6 +112,16 @@ def _stored(path: Path) -> DictConfig:
             f"{path} is damaged ({fault}); copy it from a backup of the run, or start a new run."
         )
     return config
+
+
+def _lacks(config: Any) -> str | None:
+    """What every configuration of a run has and this one does not."""
+    if not isinstance(config, DictConfig):
+        return "it holds no settings"
+    plain = OmegaConf.to_container(config)
+    lost = [key for key in ("env", "seed") if key not in plain]
+    lost += [key for key in _SECTIONS if not isinstance(plain.get(key), dict)]
+    return f"it lacks {', '.join(lost)}" if lost else None
 
 
 def _missing(config: DictConfig, defaults: DictConfig) -> Iterator[tuple[str, Any]]:
@@ -115,10 +143,7 @@ def _override(config: DictConfig, override: Override, newer: Container[str]) -> 
     section, _, name = key.rpartition(".")
     parent = OmegaConf.select(config, section) if section else config
     known = isinstance(parent, DictConfig) and name in parent
-    if override.is_delete():
-        raise ValueError(f"~{key} would take a setting away, which a run needs; give it a value.")
-    if known and override.is_add() and not override.is_force_add():
-        raise ValueError(f"+{key} is a setting that is there already; leave the plus out.")
+    check_prefix(override, known)
     presets = ("learner", "experiment", "faithful")
     if (
         not known

@@ -1,0 +1,121 @@
+"""The configuration that a run goes on with, whatever became of it and whatever is asked for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from tests.configs import tiny
+from torchrl_etl.training import resumed_config, validate
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    """The configuration that a run left."""
+    path = tmp_path / "config.yaml"
+    path.write_text(OmegaConf.to_yaml(tiny(f"run_dir='{tmp_path}'", "frames=1000")))
+    return path
+
+
+def changed(file: Path, **values) -> None:
+    config = OmegaConf.load(file)
+    for key, value in values.items():
+        OmegaConf.update(config, key.replace("__", "."), value, force_add=True)
+    file.write_text(OmegaConf.to_yaml(config))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"- a\n- list\n",
+        b"just words",
+        b"learn: [not closed",
+        b"learn: ${not closed",
+        b"\x00\xff\xfe",
+        b"env: overactuated\nseed: 0\nexplore: 3\nlearn: {}\ncheckpoint: {}\n",
+        b"env: overactuated\nseed: 0\nexplore: {}\nlearn: null\ncheckpoint: {}\n",
+    ],
+)
+def test_a_damaged_configuration_is_one_sentence(content, file):
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="is damaged") as caught:
+        resumed_config(file.parent)
+    assert "\n" not in str(caught.value)
+    assert "copy it from a backup of the run, or start a new run" in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_one_that_was_cut_short_is_damaged(share, file):
+    text = file.read_text()
+    file.write_text(text[: int(share * len(text))])
+    with pytest.raises(ValueError, match="is damaged"):
+        resumed_config(file.parent)
+
+
+def test_one_of_a_release_with_other_names_says_so(file):
+    changed(file, learn__anchor=0.1)
+    words = "other names (learn.anchor, now learn.decoder.distillation_weight)"
+    with pytest.raises(ValueError, match=re.escape(words)):
+        resumed_config(file.parent, defaults=tiny())
+
+
+def test_settings_newer_than_the_run_take_their_defaults_with_a_warning(file):
+    config = OmegaConf.load(file)
+    del config.learn["prefill"], config["vaf_curve"]
+    file.write_text(OmegaConf.to_yaml(config))
+    with pytest.warns(UserWarning, match=r"did not have learn\.prefill=.*vaf_curve=|vaf_curve=.*"):
+        resumed = resumed_config(file.parent, defaults=tiny())
+    assert resumed.learn.prefill == tiny().learn.prefill
+    assert resumed.vaf_curve == tiny().vaf_curve
+    validate(resumed)
+
+
+def test_a_newer_setting_can_be_answered_when_resuming(file, recwarn):
+    config = OmegaConf.load(file)
+    del config.learn["prefill"]
+    file.write_text(OmegaConf.to_yaml(config))
+    asked = not tiny().learn.prefill
+    resumed = resumed_config(file.parent, [f"learn.prefill={asked}"], defaults=tiny())
+    assert resumed.learn.prefill is asked
+    assert not [warning for warning in recwarn if "did not have" in str(warning.message)]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["+log_every=5"], "+log_every is a setting that is there already; leave the plus out."),
+        (["~learn.frames"], "~learn.frames would take a setting away"),
+        (["~learn.frames=608"], "~learn.frames would take a setting away"),
+        (["learn.frame=5"], "no setting 'learn.frame'; did you mean learn.frames?"),
+        (["+learn.sac.gama=0.9"], "no setting 'learn.sac.gama'; did you mean learn.sac.gamma?"),
+        (["++learn.sac.gama=0.9"], "no setting 'learn.sac.gama'; did you mean learn.sac.gamma?"),
+        (["zzz.yyy=1"], "no setting 'zzz.yyy'; see its config.yaml."),
+        (["seed.of=1"], "no setting 'seed.of'"),
+        (["seed=1"], "seed cannot be changed when a run is resumed"),
+        (["+env_kwargs.g=1"], "env_kwargs.g cannot be changed when a run is resumed"),
+        (["learner=plain"], "learner cannot be changed when a run is resumed"),
+        (["learn.frames=[1"], "learn.frames=[1"),
+        (["frames=2000", "learn.frames=900"], "each sets the budget; give one."),
+    ],
+)
+def test_what_cannot_be_asked_for_is_one_sentence(overrides, words, file):
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        resumed_config(file.parent, overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_may_change_is_taken_also_below_a_section_of_another_library(file):
+    asked = ["log_every=7", "++checkpoint.every=9", "+logger_kwargs.wandb.project=mine"]
+    resumed = resumed_config(file.parent, [*asked, f"resume={file.parent}"])
+    assert (resumed.log_every, resumed.checkpoint.every) == (7, 9)
+    assert resumed.logger_kwargs.wandb.project == "mine"
+    assert resumed.frames == 1000
+
+
+def test_a_budget_of_learning_replaces_that_of_all_frames(file):
+    resumed = resumed_config(file.parent, ["learn.frames=900"])
+    assert resumed.frames is None and resumed.learn.frames == 900
