@@ -23,6 +23,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     a backward half: on CPUs without AVX-512 the masks of rectifiers, kept as booleans, would cost
     as much as a third of the products.
 
+    It draws from PyTorch's generator as it would uncompiled, so the numbers are the same.
+
     Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
     the compiler does not know) costs a warning that says why; the function then runs uncompiled,
     this call included. It must change nothing but what it returns.
@@ -66,8 +68,8 @@ def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
     return CudaGraphModule(function, in_keys=[], out_keys=[], warmup=5)
 
 
-def _options() -> dict[str, Any] | None:
-    """What lets inductor (torch 2.13) compile in folders whose names have a space.
+def _options() -> dict[str, Any]:
+    """What makes inductor (torch 2.13) draw as PyTorch does, and compile where a path has a space.
 
     It hands the folder of PyTorch's libraries, its cache and its precompiled headers to a shell
     without quotes.
@@ -75,7 +77,7 @@ def _options() -> dict[str, Any] | None:
     from torch._inductor.runtime.cache_dir_utils import cache_dir, default_cache_dir
     from torch.utils.cpp_extension import TORCH_LIB_PATH
 
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = {"fallback_random": True}
     if _is_split(cache_dir()):
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"/tmp/torchinductor_{os.getuid()}"
     if _is_split(default_cache_dir()):  # where its headers are, whatever the cache is
@@ -83,7 +85,7 @@ def _options() -> dict[str, Any] | None:
     if _is_split(TORCH_LIB_PATH):
         # The symbols that a kernel needs are those of the process, which has loaded PyTorch.
         options["aot_inductor.link_libtorch"] = False
-    return options or None
+    return options
 
 
 def _is_split(path: str) -> bool:
