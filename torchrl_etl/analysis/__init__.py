@@ -1,5 +1,11 @@
 """What a run is worth: synergy diagnostics, pictures, and statistics of evaluations."""
 
+from torchrl_etl.analysis.cross_validation import (
+    CrossValidation,
+    cross_validate,
+    enough_synergies,
+    held_out_rows,
+)
 from torchrl_etl.analysis.diagnostics import (
     MixtureUsage,
     control_authority,
@@ -17,14 +23,18 @@ from torchrl_etl.analysis.statistics import Interval, interval, success_interval
 from torchrl_etl.analysis.synergy_report import describe_synergies, draw_synergies
 
 __all__ = [
+    "CrossValidation",
     "Interval",
     "JointEffects",
     "MixtureUsage",
     "control_authority",
+    "cross_validate",
     "describe_synergies",
     "direction_alignment",
     "draw_synergies",
     "embedding",
+    "enough_synergies",
+    "held_out_rows",
     "interval",
     "joint_effects",
     "learning_curves",

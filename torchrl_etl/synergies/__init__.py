@@ -7,6 +7,7 @@ from torchrl_etl.synergies.gmvae import GMVAESynergies, fit_gmvae
 from torchrl_etl.synergies.model import SynergyModel
 from torchrl_etl.synergies.nmf import NMFSynergies
 from torchrl_etl.synergies.pca import PCASynergies
+from torchrl_etl.synergies.recordings import Recording, read_recording
 from torchrl_etl.synergies.shown import ShownActions
 from torchrl_etl.synergies.vae import VAESynergies
 
@@ -16,11 +17,13 @@ __all__ = [
     "GMVAESynergies",
     "NMFSynergies",
     "PCASynergies",
+    "Recording",
     "ShownActions",
     "SynergyModel",
     "VAESynergies",
     "fit_gmvae",
     "fit_synergies",
     "load_bundle",
+    "read_recording",
     "save_bundle",
 ]

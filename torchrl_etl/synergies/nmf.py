@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -57,21 +59,19 @@ class NMFSynergies(AffineSynergies):
     def factorize(self, actions: np.ndarray) -> np.ndarray:
         # Takes a second to import, which a worker that only decodes should not spend.
         from sklearn.decomposition import NMF
-        from sklearn.exceptions import ConvergenceWarning
 
         self.model = NMF(self.num_synergies, init="nndsvda", max_iter=self.max_iter, random_state=0)
         above = self._above_low(actions)
         # Where no muscle ever moves there is nothing to divide, and it fails.
         above[0] += 1e-9 * (not above.any())
-        with warnings.catch_warnings():
-            # The last digits that more iterations would bring do not change a synergy.
-            warnings.simplefilter("ignore", ConvergenceWarning)
+        with _unfinished():
             self.model.fit(above)
         return self.model.components_
 
     def coefficients(self, actions: Tensor) -> Tensor:
         rows = actions.detach().reshape(-1, len(self.low)).cpu().double().numpy()
-        found = torch.as_tensor(self.model.transform(self._above_low(rows)))
+        with _unfinished():
+            found = torch.as_tensor(self.model.transform(self._above_low(rows)))
         return found.to(self.low).reshape(*actions.shape[:-1], self.num_synergies)
 
     def compose(self, coefficients: Tensor) -> Tensor:
@@ -84,3 +84,13 @@ class NMFSynergies(AffineSynergies):
 
     def _above_low(self, actions: np.ndarray) -> np.ndarray:
         return (actions - self.low.cpu().double().numpy()).clip(min=0.0)
+
+
+@contextmanager
+def _unfinished() -> Iterator[None]:
+    """The last digits that more iterations would bring do not change a synergy."""
+    from sklearn.exceptions import ConvergenceWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        yield

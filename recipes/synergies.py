@@ -1,0 +1,195 @@
+"""Synergies of recorded muscles: how many there are, by cross-validation, and a bundle of them.
+
+    python recipes/synergies.py data=emg.csv kind=nmf num=1..8
+    python recipes/synergies.py data=emg.csv leave_out=[time] normalize=true trial=subject
+
+Column names are muscle names. These are all settings, with their defaults:
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from torch import Tensor
+
+from torchrl_etl.analysis import (
+    CrossValidation,
+    cross_validate,
+    enough_synergies,
+    synergy_heatmap,
+    vaf_curve,
+)
+from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
+from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
+from torchrl_etl.io import write_atomically
+from torchrl_etl.synergies import (
+    SYNERGY_MODELS,
+    Recording,
+    SynergyModel,
+    fit_synergies,
+    read_recording,
+    save_bundle,
+)
+
+CONF = Path(__file__).parent / "conf"
+HEADER = ("synergies", "fitted", "held out", "worst fold", "best fold")
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="recording")
+def main(config: DictConfig) -> None:
+    with one_sentence(ValueError, OSError):
+        kind, options = kind_and_options(config)
+        recording = load(config)
+        numbers = numbers_of_synergies(config.num, len(recording.muscles))
+        trials = recording.trials
+        by_trial = trials is not None and len(set(trials)) > 1
+
+        def fit(number: int, rows: Tensor) -> SynergyModel:
+            torch.manual_seed(config.seed)
+            return fit_synergies(rows, kind, number, low=config.low, high=config.high, **options)
+
+        print(
+            f"{len(recording.activity):,} rows of {len(recording.muscles)} muscles; held out: "
+            + (f"whole trials of {len(set(trials))}" if by_trial else "blocks of rows")
+        )
+        print("  ".join(f"{title:>10}" for title in HEADER))
+        found, models = {}, {}
+        for number in numbers:
+            found[number], models[number] = cross_validate(
+                lambda rows, number=number: fit(number, rows),
+                recording.activity,
+                folds=config.folds,
+                trials=trials if by_trial else None,
+            )
+            print(f"{number:>10}  " + "  ".join(f"{value:>10.3f}" for value in found[number]))
+        chosen = enough_synergies(found, config.vaf)
+        folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
+        leave(folder, recording, kind, models[chosen], found, config)
+    enough = found[chosen].held_out >= config.vaf
+    print(
+        f"{chosen} synergies account for {found[chosen].held_out:.0%} of held-out rows"
+        + ("" if enough else f", none of these numbers for {config.vaf:.0%}")
+    )
+    print(f"  all of it   {folder}")
+
+
+def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
+    """The kind of synergies and keyword arguments of its model, all settings checked."""
+    if config.data is None:
+        raise ValueError("no recording is named; pass data=FILE, a .csv, .npy or .npz file.")
+    if not isinstance(config.leave_out, ListConfig):
+        raise ValueError(
+            f"leave_out is {config.leave_out!r}; it must be a list of columns, such as [time]."
+        )
+    check_flag(normalize=config.normalize)
+    check_integer(2, folds=config.folds)
+    check_integer(1, updates=config.updates)
+    check_integer(0, seed=config.seed)
+    check_real("[0, 1]", vaf=config.vaf)
+    check_real("(-inf, inf)", low=config.low, high=config.high)
+    options = OmegaConf.to_container(config.synergies, resolve=True)
+    kind = options.pop("kind")
+    options.pop("bundle")
+    if kind in ("gmvae", "vae"):
+        options["updates"] = config.updates
+    return kind, options
+
+
+def load(config: DictConfig) -> Recording:
+    recording = read_recording(config.data, trial=config.trial, leave_out=config.leave_out)
+    if config.normalize:
+        largest = recording.activity.max(0)
+        if not (largest > 0).all():
+            muscle = recording.muscles[int((largest <= 0).argmax())]
+            raise ValueError(
+                f"{muscle!r} is never above 0, so its largest value is no unit; rectify the "
+                "recording, or leave normalize=false."
+            )
+        recording = recording._replace(activity=recording.activity / largest)
+    for bound, ends in (("low", recording.activity.min(0)), ("high", recording.activity.max(0))):
+        beyond = ends < config.low if bound == "low" else ends > config.high
+        if beyond.any():
+            first = int(beyond.argmax())
+            raise ValueError(
+                f"{recording.muscles[first]!r} reaches {ends[first]:g}, beyond {bound}="
+                f"{config[bound]:g}; give low= and high= in the recording's units or "
+                "normalize=true, or leave out what is no muscle with leave_out=."
+            )
+    return recording
+
+
+def numbers_of_synergies(num: Any, muscles: int) -> Sequence[int]:
+    """What ``num`` asks for, less what is more than there are muscles."""
+    if isinstance(num, str) and (ends := re.fullmatch(r"(\d+)\.\.(\d+)", num)):
+        asked = list(range(int(ends[1]), int(ends[2]) + 1))
+    else:
+        asked = list(num) if isinstance(num, ListConfig) else [num]
+    try:
+        check_sizes(num=asked)
+    except ValueError:
+        raise ValueError(
+            f"num is {num!r}; it must be numbers of synergies, such as 4, 1..8 or [2,4,8]."
+        ) from None
+    numbers = sorted({number for number in asked if number <= muscles})
+    if not numbers:
+        raise ValueError(f"num is {num}, more than the {muscles} muscles; ask for fewer synergies.")
+    return numbers
+
+
+def leave(
+    folder: Path,
+    recording: Recording,
+    kind: str,
+    model: SynergyModel,
+    found: dict[int, CrossValidation],
+    config: DictConfig,
+) -> None:
+    """Table, bundle and pictures."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("synergies", *CrossValidation._fields))
+    rows.writerows((number, *found[number]) for number in found)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "vaf.csv", text.getvalue())
+    decoder = model.decoder(recording.activity)
+    save_bundle(
+        decoder,
+        folder / "synergies",
+        task=Path(config.data).stem,
+        actuators=recording.muscles,
+        kind=kind,
+        facts={
+            "vaf": found[model.num_synergies].fitted,
+            "vaf_held_out": found[model.num_synergies].held_out,
+            "rows": len(recording.activity),
+            "seed": config.seed,
+        },
+    )
+    pictures = folder / "pictures"
+    synergy_heatmap(decoder, recording.muscles, pictures / "synergies.png")
+    series = {
+        f"{kind.upper()}, fitted": [of.fitted for of in found.values()],
+        "held out": [of.held_out for of in found.values()],
+    }
+    vaf_curve(list(found), series, pictures / "vaf.png", chosen_d=model.num_synergies)
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:]
+    with one_sentence(ValueError):
+        for i, argument in enumerate(arguments):
+            if argument.startswith("kind="):
+                check_choice("kind", kind := argument.removeprefix("kind="), list(SYNERGY_MODELS))
+                arguments[i] = f"synergies={kind}"
+    sys.argv[1:] = quote_paths(arguments, "data", "out")
+    check_overrides(CONF / "recording.yaml", sys.argv[1:], __doc__)
+    main()

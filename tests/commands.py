@@ -1,0 +1,27 @@
+"""A recipe in this process: what a person types, without the seconds that imports take."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+from pytest import MonkeyPatch
+
+from tests.configs import ROOT
+
+
+def command(recipe: str, *arguments: str) -> int:
+    """Run a recipe with arguments as its command line; returns its exit code.
+
+    ``sys.exit`` with a text prints it, as the interpreter does.
+    """
+    with MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [recipe, *arguments])
+        try:
+            runpy.run_path(str(ROOT / "recipes" / recipe), run_name="__main__")
+        except SystemExit as left:
+            if isinstance(left.code, str):
+                sys.stderr.write(f"{left.code}\n")
+                return 1
+            return left.code or 0
+    return 0

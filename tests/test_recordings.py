@@ -1,0 +1,197 @@
+"""Synergies of recordings: files of laboratories, held-out rows, and the command."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from tests.commands import command
+from torchrl_etl.analysis import cross_validate, held_out_rows, variance_accounted_for
+from torchrl_etl.synergies import fit_synergies, load_bundle, read_recording
+
+MUSCLES = tuple(f"m{i}" for i in range(6))
+
+
+def emg(rows: int = 240, sources: int = 3) -> np.ndarray:
+    """Activity of six muscles in [0, 1] that few sources drive."""
+    rng = np.random.default_rng(0)
+    return rng.random((rows, sources)) @ rng.random((sources, 6)) / sources
+
+
+def write(path, activity, names=MUSCLES, **columns):
+    table = [*activity.T.tolist(), *columns.values()]
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([(*names, *columns), *zip(*table, strict=True)])
+    return path
+
+
+def test_a_csv_names_its_muscles_and_may_have_trials_and_other_columns(tmp_path):
+    activity = emg(8)
+    trials = ["walk"] * 4 + ["run"] * 4
+    path = write(tmp_path / "emg.csv", activity, time=range(8), trial=trials)
+    found = read_recording(path, leave_out=["time"])
+    assert found.muscles == MUSCLES
+    np.testing.assert_allclose(found.activity, activity)
+    assert found.trials.tolist() == trials
+    other = path.with_name("semicolons.csv")
+    other.write_text("\ufeff" + path.read_text().replace(",", ";") + "\n\n")
+    np.testing.assert_allclose(read_recording(other, leave_out=["time"]).activity, activity)
+    assert read_recording(path, trial="time", leave_out=["trial"]).trials.tolist()[1] == "1"
+
+
+def test_arrays_of_numpy_are_read_in_every_form(tmp_path):
+    activity, trials = emg(8), np.arange(8) // 4
+    np.save(tmp_path / "plain.npy", activity)
+    plain = read_recording(tmp_path / "plain.npy")
+    assert plain.muscles[0] == "muscle_0" and plain.trials is None
+    records = np.rec.fromarrays(activity.T, names=list(MUSCLES))
+    np.save(tmp_path / "fields.npy", np.asarray(records))
+    np.savez(tmp_path / "matrix.npz", emg=activity, names=np.array(MUSCLES), trial=trials)
+    np.savez(tmp_path / "columns.npz", trial=trials, **dict(zip(MUSCLES, activity.T, strict=True)))
+    for name in ("fields.npy", "matrix.npz", "columns.npz"):
+        found = read_recording(tmp_path / name)
+        assert found.muscles == MUSCLES, name
+        np.testing.assert_array_equal(found.activity, activity)
+        assert (found.trials is None) == (name == "fields.npy")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a,b\n1,2\n3\n", "Line 3 of .* has 1 entries and the first line 2"),
+        ("a,b\n1,2\n3,\n5,6\n", "'b' in .* has no value in row 1; fill"),
+        ("a,b\n1,2\nNaN,3\n5,NA\n", "'a' in .* no value in row 1, one of 2 such places"),
+        ("a,b\n1,2\nx,3\n", "Row 1 of 'a' in .* is 'x', not a number"),
+        ("a,b\n1,2\n1,3\n", "'a' in .* has the same value in every row; .*leave_out=\\[a\\]"),
+        ("a,a\n1,2\n2,3\n", "2 columns 'a'"),
+        ("1,2\n3,4\n", "names no columns"),
+        ("", "names no columns"),
+        ("a,b\n1,2\n", "1 row"),
+        ("trial\n1\n2\n", "no column that is a muscle"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_one_sentence(text, words, tmp_path):
+    path = tmp_path / "emg.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=words):
+        read_recording(path)
+
+
+def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
+    np.save(tmp_path / "pickle.npy", np.array([{}, {}]), allow_pickle=True)
+    np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
+    np.savez(tmp_path / "two.npz", a=np.zeros((2, 3)), b=np.zeros((2, 3)))
+    np.savez(tmp_path / "ragged.npz", a=np.arange(3), b=np.arange(4))
+    np.savez(tmp_path / "names.npz", a=emg(4), names=np.array(["x"]))
+    np.savez(tmp_path / "text.npz", a=np.array(["x", "y"]), b=np.arange(2))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "two.npz").read_bytes()[:200])
+    (tmp_path / "latin.csv").write_bytes("a,\xe4\n1,2\n".encode("latin-1"))
+    (tmp_path / "emg.mat").write_bytes(b"x")
+    for name, words in {
+        "pickle.npy": "does not hold arrays of numbers",
+        "cube.npy": r"shape \(2, 3, 4\)",
+        "two.npz": "has the arrays a, b; keep the one",
+        "ragged.npz": "3 and 4 rows",
+        "names.npz": "1 names for the 6 columns",
+        "text.npz": "'a' in .* of type",
+        "cut.npz": "does not hold arrays of numbers",
+        "latin.csv": "not a text in UTF-8",
+        "emg.mat": "pass a .csv, .npy or .npz file",
+        "none.csv": "no file",
+    }.items():
+        with pytest.raises((ValueError, FileNotFoundError), match=words):
+            read_recording(tmp_path / name)
+
+
+def test_trials_stay_together_and_are_spread_evenly():
+    trials = np.repeat(["a", "b", "c", "d"], [5, 1, 3, 1])
+    parts = held_out_rows(10, folds=2, trials=trials)
+    assert [set(trials[part]) for part in parts] == [{"a"}, {"b", "c", "d"}]
+    assert sorted(np.concatenate(parts)) == list(range(10))
+    assert len(held_out_rows(10, folds=9, trials=trials)) == 4
+    with pytest.raises(ValueError, match="All rows are of trial a"):
+        held_out_rows(3, trials=["a"] * 3)
+
+
+class Mean:
+    """Answers the mean of what it was fitted to."""
+
+    def __init__(self, rows):
+        self.mean = rows.mean(0)
+
+    def reconstruct(self, rows):
+        return self.mean.expand_as(rows)
+
+
+def test_held_out_variance_is_that_of_models_that_have_not_seen_the_rows():
+    rows = np.array([[0.0], [2.0], [4.0], [6.0]])
+    found, model = cross_validate(Mean, rows, folds=2)
+    # Fitted: the mean itself. Held out: 5 for 0 and 2, 1 for 4 and 6: 25 + 9 + 9 + 25 of 20.
+    assert found.fitted == 0.0
+    assert found.held_out == pytest.approx(1 - 68 / 20)
+    assert found.lowest == found.highest == pytest.approx(1 - 34 / 2)
+    assert model.mean.item() == 3.0
+
+
+@pytest.mark.parametrize("kind", ["nmf", "pca"])
+def test_three_sources_are_found_to_be_three(kind):
+    activity = torch.as_tensor(emg(), dtype=torch.float32)
+    vaf = [
+        cross_validate(lambda rows, d=d: fit_synergies(rows, kind, d, low=0.0), activity)[0]
+        for d in (1, 2, 3)
+    ]
+    assert vaf[0].held_out < vaf[1].held_out < 0.98 < vaf[2].held_out
+    assert all(of.lowest <= of.held_out <= of.highest for of in vaf)
+
+
+def test_the_command_leaves_a_table_a_bundle_and_pictures(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = write(tmp_path / "emg.csv", emg(), trial=[i // 60 for i in range(240)])
+    settings = ("kind=nmf", "num=2..9", "vaf=0.98", "out=found")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert command("synergies.py", f"data={path}", *settings) == 0
+    said = capsys.readouterr().out
+    assert "240 rows of 6 muscles; held out: whole trials of 4" in said
+    assert "3 synergies account for 100% of held-out rows" in said
+    folder = tmp_path / "found"
+    with (folder / "vaf.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [row["synergies"] for row in table] == list("23456")  # there are six muscles
+    decoder, info = load_bundle(folder)
+    assert (info.kind, info.actuators, info.num_synergies) == ("nmf", MUSCLES, 3)
+    assert info.facts["vaf_held_out"] == pytest.approx(float(table[1]["held_out"]))
+    with torch.no_grad():
+        told = decoder.module(decoder.encode(emg()))
+    assert variance_accounted_for(emg(), told) > 0.9
+    for name in ("synergies.png", "vaf.png"):
+        assert (folder / "pictures" / name).stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["kind=nmff"], "kind is 'nmff'; choose one of"),
+        (["num=0"], "num is 0; it must be numbers of synergies"),
+        (["num=a..b"], "num is 'a..b'"),
+        (["num=[7,8]"], "more than the 6 muscles"),
+        (["high=0.5"], "beyond high=0.5; give low= and high="),
+        (["trial=subject"], "no column 'subject'"),
+        (["leave_out=m0"], "leave_out is 'm0'; it must be a list"),
+        (["data=null"], "no recording is named"),
+        (["data=other.csv"], "no file"),
+        (["normalise=true"], "did you mean normalize"),
+    ],
+)
+def test_a_wrong_setting_of_the_command_is_one_sentence(
+    arguments, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    path = write(tmp_path / "emg.csv", emg(20))
+    assert command("synergies.py", f"data={path}", *arguments) != 0
+    assert words in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["emg.csv"]
