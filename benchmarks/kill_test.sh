@@ -22,7 +22,7 @@ settings="learn.replay_ratio=0.125 learn.learning_starts=5000 learn.buffer_size=
   evaluation.every=25000 evaluation.episodes=5 checkpoint.every=50000 log_every=5000"
 
 queue() {
-  $python recipes/bench.py "tasks=[$task]" "methods=[$1]" 'seeds=[0,1]' frames="$frames" \
+  $python recipes/sweep.py "tasks=[$task]" "methods=[$1]" 'seeds=[0,1]' frames="$frames" \
     out=$out jobs=1 settings="$(echo $settings)"
 }
 

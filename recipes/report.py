@@ -1,4 +1,4 @@
-"""Report of a bench: tables at equal frames and learning curves, from its results.csv.
+"""Report of a sweep: tables at equal frames and learning curves, from its results.csv.
 
     python recipes/report.py results=FOLDER [out=FOLDER] [frames=N] [control=sac] [repetitions=2000]
 
@@ -16,8 +16,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_etl.analysis.bench_report import write_report
-from torchrl_etl.analysis.bench_results import read_bench
+from torchrl_etl.analysis.sweep_report import write_report
+from torchrl_etl.analysis.sweep_results import read_sweep
 from torchrl_etl.command_line import one_sentence
 
 DEFAULTS = {"results": "", "out": "", "frames": "", "control": "sac", "repetitions": "2000"}
@@ -30,17 +30,17 @@ def main(arguments: Sequence[str]) -> None:
         repetitions = _count("repetitions", settings["repetitions"])
         if not settings["results"]:
             raise ValueError("no results are named; pass results=FOLDER, which has results.csv.")
-        bench = read_bench(settings["results"])
+        sweep = read_sweep(settings["results"])
         folder = Path(settings["out"] or settings["results"])
         tasks, methods = write_report(
-            bench,
+            sweep,
             folder,
             arguments,
             control=settings["control"],
             frames=frames,
             repetitions=repetitions,
         )
-    print(f"tasks: {tasks}, methods: {methods}, finished runs: {len(bench.finished)}")
+    print(f"tasks: {tasks}, methods: {methods}, finished runs: {len(sweep.finished)}")
     print(f"  written to {folder / 'report.md'}")
 
 

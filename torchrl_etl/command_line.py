@@ -68,7 +68,7 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
         key = key.lstrip("+~")
         if argument in ("-m", "--multirun"):
             sys.exit(
-                f"Error: {argument} is not supported; recipes/bench.py runs several, such as "
+                f"Error: {argument} is not supported; recipes/sweep.py runs several, such as "
                 "methods=[sac,etl] seeds=[0,1], side by side, and goes on if it is interrupted."
             )
         if argument.startswith("-") or key.partition(".")[0] == "hydra" or key.startswith("hydra/"):

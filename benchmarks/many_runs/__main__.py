@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_etl.analysis.bench_results import COLUMNS
+from torchrl_etl.analysis.sweep_results import COLUMNS
 from torchrl_etl.collectors.seeds import training_seed
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.training.run_folder import facts

@@ -1,4 +1,4 @@
-"""Published learning curves, to stand beside a bench's own.
+"""Published learning curves, to stand beside a sweep's own.
 
 ``published_curves.csv`` holds means over seeds at 100k to 1M environment frames, taken from the
 public results of FlashSAC and of the baselines that it ships: SimbaV2, XQC, TD-MPC2, MR.Q and PPO.
@@ -108,7 +108,7 @@ def caveats(env_id: str) -> str:
     Examples:
         >>> print(caveats("dog-run"))
         Published: means over seeds from the public results of FlashSAC and of the baselines that \
-it ships, not measured here; no spread was published; their wrappers differ from this bench's \
+it ships, not measured here; no spread was published; their wrappers differ from those here \
 (TD-MPC2 ignores termination).
     """
     differences = ["TD-MPC2 ignores termination"]
@@ -118,8 +118,8 @@ it ships, not measured here; no spread was published; their wrappers differ from
         differences.insert(0, "SimbaV2 cuts Key Turn at 100 steps")
     return (
         "Published: means over seeds from the public results of FlashSAC and of the baselines that "
-        "it ships, not measured here; no spread was published; their wrappers differ from this "
-        f"bench's ({'; '.join(differences)})."
+        "it ships, not measured here; no spread was published; their wrappers differ from "
+        f"those here ({'; '.join(differences)})."
     )
 
 

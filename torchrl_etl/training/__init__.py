@@ -1,21 +1,21 @@
 """What runs a learner: a stage, the loop around it, checkpoints, evaluation, queues of runs."""
 
-from torchrl_etl.training.bench import Bench, Run
 from torchrl_etl.training.config import validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.resumed import resumed_config
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.sweep import Run, Sweep
 from torchrl_etl.training.video import check_video_size, record_episodes
 
 __all__ = [
-    "Bench",
     "Context",
     "Evaluation",
     "Interrupted",
     "Run",
     "Stage",
+    "Sweep",
     "check_video_size",
     "evaluate",
     "record_episodes",

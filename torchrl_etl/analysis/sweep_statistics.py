@@ -1,4 +1,4 @@
-"""What a bench's runs say at an equal number of frames: interquartile means and comparisons.
+"""What a sweep's runs say at an equal number of frames: interquartile means and comparisons.
 
 The estimators are those of Agarwal et al., "Deep reinforcement learning at the edge of the
 statistical precipice" (2021), and the intervals come from the authors' library, rliable: seeds are
@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from rliable import library, metrics
 from scipy.stats import bootstrap
 
-from torchrl_etl.analysis.bench_results import BenchRun
 from torchrl_etl.analysis.published import best_published, environment_id
 from torchrl_etl.analysis.statistics import Interval
+from torchrl_etl.analysis.sweep_results import SweepRun
 
 __all__ = [
     "Comparison",
@@ -159,14 +159,14 @@ class Comparison:
     results: tuple[MethodResult, ...]
     untrained: float
     untrained_frames: int
-    short: tuple[BenchRun, ...]
-    stale: tuple[BenchRun, ...]
+    short: tuple[SweepRun, ...]
+    stale: tuple[SweepRun, ...]
 
     def result(self, method: str) -> MethodResult | None:
         return next((result for result in self.results if result.method == method), None)
 
 
-def common_budget(runs: Sequence[BenchRun]) -> int:
+def common_budget(runs: Sequence[SweepRun]) -> int:
     """The largest number of frames at which all runs can be compared.
 
     No run ends before it; and if possible every run has an evaluation that stands for it.
@@ -183,7 +183,7 @@ def common_budget(runs: Sequence[BenchRun]) -> int:
 
 
 def compare(
-    runs: Sequence[BenchRun],
+    runs: Sequence[SweepRun],
     methods: Sequence[str],
     control: str,
     *,
@@ -195,7 +195,7 @@ def compare(
     A run counts with its last evaluation up to 1 % past that number: nothing is interpolated.
 
     Args:
-        runs (sequence of BenchRun): the finished runs of one task and goal.
+        runs (sequence of SweepRun): the finished runs of one task and goal.
         methods (sequence of str): which methods, in which order.
         control (str): the method against which improvement is measured.
 
@@ -328,7 +328,7 @@ def _normalized(scaled: Sequence[tuple[Comparison, Scale]], method: str) -> list
 
 def _result(
     method: str,
-    runs: Sequence[BenchRun],
+    runs: Sequence[SweepRun],
     budget: int,
     baseline: Sequence[float],
     is_control: bool,
@@ -348,7 +348,7 @@ def _result(
     return MethodResult(method, seeds, frames, returns, *others, interval, improvement, reached)
 
 
-def _first_at(runs: Sequence[BenchRun], target: float, budget: int) -> int | None:
+def _first_at(runs: Sequence[SweepRun], target: float, budget: int) -> int | None:
     """The first evaluation within the budget at which the mean over runs is at the target."""
     begun = max(run.rows[0].frames for run in runs)
     end = max(run.at(budget).frames for run in runs)
@@ -359,7 +359,7 @@ def _first_at(runs: Sequence[BenchRun], target: float, budget: int) -> int | Non
     return None
 
 
-def _stale(run: BenchRun, budget: int) -> bool:
+def _stale(run: SweepRun, budget: int) -> bool:
     row = run.at(budget)
     return row is None or row.frames < (1 - _TOLERANCE) * budget
 

@@ -1,11 +1,11 @@
-"""Rows of a bench's results.csv, and the files and runs made of them."""
+"""Rows of a sweep's results.csv, and the files and runs made of them."""
 
 from __future__ import annotations
 
 import csv
 from pathlib import Path
 
-from torchrl_etl.analysis.bench_results import COLUMNS, read_bench
+from torchrl_etl.analysis.sweep_results import COLUMNS, read_sweep
 
 FEW = 50  # resamples of a bootstrap
 
@@ -44,5 +44,5 @@ def write(folder: Path, rows, columns=COLUMNS) -> Path:
     return folder
 
 
-def bench(folder, *runs):
-    return read_bench(write(folder, [one for rows in runs for one in rows]))
+def sweep(folder, *runs):
+    return read_sweep(write(folder, [one for rows in runs for one in rows]))

@@ -1,4 +1,4 @@
-"""The report of a bench: its tables and pictures."""
+"""The report of a sweep: its tables and pictures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_etl.analysis.bench_pictures import looks, overall_picture, task_picture
-from torchrl_etl.analysis.bench_results import BenchResults
-from torchrl_etl.analysis.bench_statistics import (
+from torchrl_etl.analysis.published import caveats, environment_id, published_curves
+from torchrl_etl.analysis.statistics import Interval
+from torchrl_etl.analysis.sweep_pictures import looks, overall_picture, task_picture
+from torchrl_etl.analysis.sweep_results import SweepResults
+from torchrl_etl.analysis.sweep_statistics import (
     Comparison,
     MethodResult,
     OverallResult,
@@ -23,8 +25,6 @@ from torchrl_etl.analysis.bench_statistics import (
     normalize,
     overall,
 )
-from torchrl_etl.analysis.published import caveats, environment_id, published_curves
-from torchrl_etl.analysis.statistics import Interval
 from torchrl_etl.io import write_atomically
 
 __all__ = ["write_report"]
@@ -41,7 +41,7 @@ One seed says nothing about spread and gets no interval. `solved` is the share o
 
 
 def write_report(
-    bench: BenchResults,
+    sweep: SweepResults,
     folder: Path,
     arguments: Sequence[str],
     *,
@@ -52,7 +52,7 @@ def write_report(
     """Write report.md and its pictures.
 
     Args:
-        bench (BenchResults): the evaluations.
+        sweep (SweepResults): the evaluations.
         folder (path): where to; made if it is not there.
         arguments (sequence of str): settings that led to this report, to be named in it.
 
@@ -68,12 +68,12 @@ def write_report(
     Raises:
         ValueError: for a control that was not run, or frames that no run reached.
     """
-    methods = _methods(bench, control)
+    methods = _methods(sweep, control)
     folder.mkdir(parents=True, exist_ok=True)
     styles = looks(methods)
     comparisons = []
-    for setting in bench.settings:
-        runs = [run for run in bench.finished if run.setting == setting]
+    for setting in sweep.settings:
+        runs = [run for run in sweep.finished if run.setting == setting]
         if runs:
             comparison = compare(runs, methods, control, frames=frames, repetitions=repetitions)
             comparisons.append(comparison)
@@ -84,26 +84,26 @@ def write_report(
     if results:
         overall_picture(results, styles, folder / "overall.png")
     parts = [
-        "# Bench report",
-        *_header(bench, arguments, control),
+        "# Sweep report",
+        *_header(sweep, arguments, control),
         "## Over all tasks",
         *_overall(results, comparisons, scales, control),
     ]
-    for setting in bench.settings:
+    for setting in sweep.settings:
         found = next((c for c in comparisons if c.setting == setting), None)
         parts += ["## {} ({} goal)".format(*setting)]
         parts += _task(found, methods, control) if found else ["No run finished."]
-    parts += ["## Runs that did not end", *_unfinished(bench)]
-    parts += ["## What produced the numbers", *_origins(bench)]
+    parts += ["## Runs that did not end", *_unfinished(sweep)]
+    parts += ["## What produced the numbers", *_origins(sweep)]
     write_atomically(folder / "report.md", "\n\n".join(parts) + "\n")
     return len(comparisons), len(methods)
 
 
-def _methods(bench: BenchResults, control: str) -> list[str]:
+def _methods(sweep: SweepResults, control: str) -> list[str]:
     """The methods that finished a run, the control first."""
-    if not bench.finished:
-        raise ValueError(f"None of the {len(bench.runs)} runs finished: nothing to report.")
-    methods = sorted({run.method for run in bench.finished})
+    if not sweep.finished:
+        raise ValueError(f"None of the {len(sweep.runs)} runs finished: nothing to report.")
+    methods = sorted({run.method for run in sweep.finished})
     if control not in methods:
         near = difflib.get_close_matches(control, methods, n=3)
         hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(methods)}."
@@ -111,19 +111,19 @@ def _methods(bench: BenchResults, control: str) -> list[str]:
     return [control, *(method for method in methods if method != control)]
 
 
-def _header(bench: BenchResults, arguments: Sequence[str], control: str) -> list[str]:
+def _header(sweep: SweepResults, arguments: Sequence[str], control: str) -> list[str]:
     command = shlex.join(["python", "recipes/report.py", *arguments])
     counts = (
-        f"{bench.row_count} evaluations of {len(bench.runs)} runs, of which {len(bench.finished)} "
-        f"finished and {len(bench.unfinished)} did not. Only finished runs are in tables and "
+        f"{sweep.row_count} evaluations of {len(sweep.runs)} runs, of which {len(sweep.finished)} "
+        f"finished and {len(sweep.unfinished)} did not. Only finished runs are in tables and "
         "pictures."
     )
-    if bench.replaced:
+    if sweep.replaced:
         counts += (
-            f" Evaluations of runs that were repeated later do not count ({bench.replaced}): the "
+            f" Evaluations of runs that were repeated later do not count ({sweep.replaced}): the "
             "newest row of a run does."
         )
-    never = sorted({run.method for run in bench.unfinished} - {r.method for r in bench.finished})
+    never = sorted({run.method for run in sweep.unfinished} - {r.method for r in sweep.finished})
     if never:
         counts += f" No run finished of {', '.join(never)}."
     return [f"`{command}`", counts, HOW_TO_READ.format(control=control)]
@@ -224,22 +224,22 @@ def _method_row(result: MethodResult, solved: bool) -> tuple[str, ...]:
     )
 
 
-def _unfinished(bench: BenchResults) -> list[str]:
-    if not bench.unfinished:
+def _unfinished(sweep: SweepResults) -> list[str]:
+    if not sweep.unfinished:
         return ["None."]
     return [
         "\n".join(
             f"- {run}: {run.status}, last evaluated at {run.last_frames:,} frames"
-            for run in bench.unfinished
+            for run in sweep.unfinished
         )
     ]
 
 
-def _origins(bench: BenchResults) -> list[str]:
+def _origins(sweep: SweepResults) -> list[str]:
     """Commits, machines and versions of the finished runs, with how many runs each has."""
     commits, machines, versions = Counter(), Counter(), Counter()
     mixed = []
-    for run in bench.finished:
+    for run in sweep.finished:
         own = {row.commit or "unknown" for row in run.rows}
         commits.update(own)
         if len(own) > 1:

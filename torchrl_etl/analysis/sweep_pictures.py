@@ -1,4 +1,4 @@
-"""Pictures of a bench: learning curves of a task beside published ones, and methods over all tasks.
+"""Pictures of a sweep: learning curves of a task beside published ones, and methods over all tasks.
 
 Every function draws into a PNG at ``path`` and returns the path. A method has one colour, marker
 and line style in all pictures that are drawn with the same :func:`looks`.
@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from torchrl_etl.analysis.bench_results import BenchRun
-from torchrl_etl.analysis.bench_statistics import OverallResult, mean_band
 from torchrl_etl.analysis.canvas import FRAMES, MARKERS, SERIES, new_figure, tidy, write
 from torchrl_etl.analysis.published import (
     PublishedCurve,
@@ -24,6 +22,8 @@ from torchrl_etl.analysis.published import (
     environment_id,
     published_curves,
 )
+from torchrl_etl.analysis.sweep_results import SweepRun
+from torchrl_etl.analysis.sweep_statistics import OverallResult, mean_band
 
 __all__ = ["looks", "overall_picture", "task_picture"]
 
@@ -63,7 +63,7 @@ def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def task_picture(
-    runs: Sequence[BenchRun],
+    runs: Sequence[SweepRun],
     styles: Mapping[str, Mapping[str, Any]],
     path: str | os.PathLike[str],
     *,
@@ -77,7 +77,7 @@ def task_picture(
     curves are grey and dashed, up to the frames that the runs reached.
 
     Args:
-        runs (sequence of BenchRun): the finished runs of one task and goal.
+        runs (sequence of SweepRun): the finished runs of one task and goal.
         styles (mapping): what :func:`looks` gave.
         path (path-like): where the PNG goes.
 
@@ -191,7 +191,7 @@ def overall_picture(
 
 def _draw_method(
     axes: Axes,
-    runs: Sequence[BenchRun],
+    runs: Sequence[SweepRun],
     column: str,
     unit: float,
     style: Mapping[str, Any],

@@ -21,11 +21,11 @@ from typing import Any
 from filelock import FileLock, Timeout
 from omegaconf import OmegaConf
 
-from torchrl_etl.analysis.bench_results import COLUMNS, RESULTS
+from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
 from torchrl_etl.training.run_folder import RunFolder
 
-__all__ = ["Bench", "Run"]
+__all__ = ["Run", "Sweep"]
 
 KEY = ("task", "goal", "method", "seed")
 EARLIER_STAGES = ("explore", "play")
@@ -122,7 +122,7 @@ class Run:
             yield row
 
 
-class Bench:
+class Sweep:
     """Runs a queue with several processes at a time and keeps one table of all evaluations.
 
     A run that is finished is left alone, be it that only its rows in the table are left; one that

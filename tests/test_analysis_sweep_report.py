@@ -1,4 +1,4 @@
-"""A bench's report says what its rows say, in tables and pictures."""
+"""A sweep's report says what its rows say, in tables and pictures."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.bench_rows import FEW, bench, run, write
-from torchrl_etl.analysis.bench_pictures import _PUBLISHED, looks, overall_picture, task_picture
+from tests.sweep_rows import FEW, run, sweep, write
 from torchrl_etl.analysis.published import caveats, published_curves
+from torchrl_etl.analysis.sweep_pictures import _PUBLISHED, looks, overall_picture, task_picture
 
 
 def report(*arguments):
@@ -36,9 +36,9 @@ def test_a_published_failure_does_not_flatten_the_curves(tmp_path, monkeypatch):
     """FlashSAC's Pen Twirl is published at −4,833 after 100,000 frames."""
     figures = []
     monkeypatch.setattr(
-        "torchrl_etl.analysis.bench_pictures.write", lambda figure, path: figures.append(figure)
+        "torchrl_etl.analysis.sweep_pictures.write", lambda figure, path: figures.append(figure)
     )
-    runs = bench(tmp_path, run([0.0, 100.0, 200.0], task="myoHandPenTwirl")).runs
+    runs = sweep(tmp_path, run([0.0, 100.0, 200.0], task="myoHandPenTwirl")).runs
     task_picture(runs, looks(["sac"]), tmp_path / "x.png")
     assert figures[0].axes[0].get_ylim()[0] > -1000
     caption = " ".join(figures[0].get_supxlabel().split())
@@ -64,7 +64,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
     rows += run([1, 5, 44], seed=0, task="dog-run", method="dep", machine="other | class")
     rows += run([1, 2], seed=0, task="dog-walk", method="eme", status="diverged")
     rows += run([1, 5, 21], seed=1, task="dog-run")  # a repeat
-    folder, out = write(tmp_path / "a bench", rows), tmp_path / "new" / "report"
+    folder, out = write(tmp_path / "a sweep", rows), tmp_path / "new" / "report"
     report(f"results={folder}", f"out={out}")
     assert "written to" in capsys.readouterr().out
     text = (out / "report.md").read_text()
@@ -110,7 +110,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
     ],
 )
 def test_a_wrong_command_gets_one_sentence(tmp_path, capsys, arguments, code, words):
-    folder = write(tmp_path / "bench", run([0, 1]))
+    folder = write(tmp_path / "sweep", run([0, 1]))
     with pytest.raises(SystemExit) as exit_:
         report(*(argument.format(folder) for argument in arguments))
     if isinstance(code, int):
@@ -121,7 +121,7 @@ def test_a_wrong_command_gets_one_sentence(tmp_path, capsys, arguments, code, wo
 
 
 def test_nothing_finished_is_said(tmp_path, capsys):
-    folder = write(tmp_path / "bench", run([0, 1], status="running"))
+    folder = write(tmp_path / "sweep", run([0, 1], status="running"))
     with pytest.raises(SystemExit):
         report(f"results={folder}")
     assert "None of the 1 runs finished" in capsys.readouterr().err

@@ -1,15 +1,15 @@
-"""What a bench's file says is read row by row, and what it cannot say is named."""
+"""What a sweep's file says is read row by row, and what it cannot say is named."""
 
 from __future__ import annotations
 
 import pytest
 
-from tests.bench_rows import bench, row, run, write
-from torchrl_etl.analysis.bench_results import COLUMNS, read_bench
+from tests.sweep_rows import row, run, sweep, write
+from torchrl_etl.analysis.sweep_results import COLUMNS, read_sweep
 
 
 def test_newest_row_wins_and_takes_the_older_attempts_tail_along(tmp_path):
-    results = bench(tmp_path, run([0, 1, 2, 3]), run([10, 11, 12]))
+    results = sweep(tmp_path, run([0, 1, 2, 3]), run([10, 11, 12]))
     assert [one.mean_return for one in results.runs[0].rows] == [10, 11, 12]
     assert results.replaced == 4 and results.row_count == 7
 
@@ -19,14 +19,14 @@ def test_a_run_is_as_finished_as_its_newest_row(tmp_path):
     broken[-1]["return"] = "nan"
     going = run([0, 1], seed=2, status="running")
     going[-1]["status"] = "finished"
-    results = bench(tmp_path, run([0, 1]), broken, going)
+    results = sweep(tmp_path, run([0, 1]), broken, going)
     assert [one.seed for one in results.finished] == [0, 2]
     assert [str(one) for one in results.unfinished] == ["myoHandKeyTurn (fixed), sac, seed 1"]
 
 
 def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
     tasks = ("aFarTask", "dog-run", "myoHandKeyTurn")
-    results = bench(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))
+    results = sweep(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))
     assert [task for task, _ in results.settings] == ["myoHandKeyTurn", "dog-run", "aFarTask"]
     assert {goal for _, goal in results.settings} == {"fixed"}
 
@@ -47,25 +47,25 @@ def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
 def test_a_bad_cell_is_named_with_its_line(tmp_path, cells, words):
     folder = write(tmp_path, [row(), row(frames=1) | cells])
     with pytest.raises(ValueError, match=words):
-        read_bench(folder)
+        read_sweep(folder)
 
 
 def test_missing_things_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="There is no folder"):
-        read_bench(tmp_path / "nowhere")
+        read_sweep(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=r"has no results\.csv"):
-        read_bench(tmp_path)
+        read_sweep(tmp_path)
     with pytest.raises(ValueError, match="lacks the columns seed, solved_time;"):
-        read_bench(
+        read_sweep(
             write(tmp_path, [row()], [c for c in COLUMNS if c not in ("seed", "solved_time")])
         )
     with pytest.raises(ValueError, match="no rows"):
-        read_bench(write(tmp_path, []))
+        read_sweep(write(tmp_path, []))
     (tmp_path / "results.csv").write_text("")
     with pytest.raises(ValueError, match="no rows"):
-        read_bench(tmp_path)
+        read_sweep(tmp_path)
     folder = write(tmp_path, [row()])
     with (folder / "results.csv").open("a") as file:
         file.write("myoHandKeyTurn,fixed,sac,0,1000")
     with pytest.raises(ValueError, match="line 3: the number of cells"):
-        read_bench(folder)
+        read_sweep(folder)

@@ -1,4 +1,4 @@
-"""Evaluations of a bench: read from one CSV file, checked row by row, grouped into runs."""
+"""Evaluations of a sweep: read from one CSV file, checked row by row, grouped into runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_etl.envs import list_tasks
 
-__all__ = ["COLUMNS", "RESULTS", "BenchResults", "BenchRow", "BenchRun", "read_bench"]
+__all__ = ["COLUMNS", "RESULTS", "SweepResults", "SweepRow", "SweepRun", "read_sweep"]
 
 COLUMNS = (
     "task",
@@ -37,7 +37,7 @@ COLUMNS = (
 RESULTS = "results.csv"
 
 
-class BenchRow(NamedTuple):
+class SweepRow(NamedTuple):
     """One evaluation; numbers that the file leaves empty are NaN.
 
     Attributes:
@@ -70,10 +70,10 @@ class BenchRow(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BenchRun:
+class SweepRun:
     """The evaluations of one method on one task with one seed, in order of frames."""
 
-    rows: tuple[BenchRow, ...]
+    rows: tuple[SweepRow, ...]
 
     @property
     def setting(self) -> tuple[str, str]:
@@ -101,7 +101,7 @@ class BenchRun:
     def last_frames(self) -> int:
         return self.rows[-1].frames
 
-    def at(self, frames: int) -> BenchRow | None:
+    def at(self, frames: int) -> SweepRow | None:
         """The last evaluation up to 1 % past ``frames``.
 
         A run ends with the batch that reaches its budget.
@@ -120,7 +120,7 @@ class BenchRun:
 
 
 @dataclass(frozen=True)
-class BenchResults:
+class SweepResults:
     """What one file of evaluations holds.
 
     Attributes:
@@ -129,16 +129,16 @@ class BenchResults:
         replaced: Number of rows that a repeated run made obsolete.
     """
 
-    runs: tuple[BenchRun, ...]
+    runs: tuple[SweepRun, ...]
     row_count: int
     replaced: int
 
     @property
-    def finished(self) -> tuple[BenchRun, ...]:
+    def finished(self) -> tuple[SweepRun, ...]:
         return tuple(run for run in self.runs if run.finished)
 
     @property
-    def unfinished(self) -> tuple[BenchRun, ...]:
+    def unfinished(self) -> tuple[SweepRun, ...]:
         return tuple(run for run in self.runs if not run.finished)
 
     @property
@@ -149,8 +149,8 @@ class BenchResults:
         return tuple(sorted(found, key=lambda pair: (order.get(pair[0], len(order)), *pair)))
 
 
-def read_bench(folder: str | os.PathLike[str]) -> BenchResults:
-    """Read ``results.csv`` of a bench's folder.
+def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
+    """Read ``results.csv`` of a sweep's folder.
 
     A run may have been repeated. Of rows with the same task, goal, method, seed and frames, the
     one that stands latest in the file counts; and where rows were replaced, so were those of the
@@ -167,9 +167,9 @@ def read_bench(folder: str | os.PathLike[str]) -> BenchResults:
     folder = Path(folder)
     path = folder / RESULTS
     if not folder.is_dir():
-        raise FileNotFoundError(f"There is no folder {folder}; pass the one that the bench wrote.")
+        raise FileNotFoundError(f"There is no folder {folder}; pass the one that the sweep wrote.")
     if not path.is_file():
-        raise FileNotFoundError(f"{folder} has no {RESULTS}; pass the folder that the bench wrote.")
+        raise FileNotFoundError(f"{folder} has no {RESULTS}; pass the folder that the sweep wrote.")
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
@@ -190,11 +190,11 @@ def read_bench(folder: str | os.PathLike[str]) -> BenchResults:
                     f"{path}, line {row.line}: {run} is finished but this evaluation has no finite "
                     "return; mend the row, or give the run's last row another status."
                 )
-    return BenchResults(runs, len(rows), len(rows) - kept)
+    return SweepResults(runs, len(rows), len(rows) - kept)
 
 
-def _runs(rows: list[BenchRow]) -> tuple[BenchRun, ...]:
-    found: dict[tuple[Any, ...], list[BenchRow]] = {}
+def _runs(rows: list[SweepRow]) -> tuple[SweepRun, ...]:
+    found: dict[tuple[Any, ...], list[SweepRow]] = {}
     for row in rows:
         found.setdefault((row.task, row.goal, row.method, row.seed), []).append(row)
     runs = []
@@ -203,11 +203,11 @@ def _runs(rows: list[BenchRow]) -> tuple[BenchRun, ...]:
         if len(latest) < len(attempts):
             reached = attempts[-1].frames
             latest = {frames: row for frames, row in latest.items() if frames <= reached}
-        runs.append(BenchRun(tuple(latest[frames] for frames in sorted(latest))))
+        runs.append(SweepRun(tuple(latest[frames] for frames in sorted(latest))))
     return tuple(sorted(runs, key=lambda run: (*run.setting, run.method, run.seed)))
 
 
-def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> BenchRow:
+def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> SweepRow:
     where = f"{path}, line {line}"
     if None in cells or None in cells.values():
         raise ValueError(
@@ -220,7 +220,7 @@ def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> BenchRow:
             raise ValueError(f"{where}: {name} is empty; every evaluation needs one.")
     seed, frames = (_integer(where, name, text[name]) for name in ("seed", "frames"))
     solved, solved_time = (_share(where, name, text[name]) for name in ("solved", "solved_time"))
-    return BenchRow(
+    return SweepRow(
         line=line,
         task=text["task"],
         goal=text["goal"] or "fixed",

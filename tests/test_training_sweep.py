@@ -16,15 +16,15 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
 from tests.configs import CONF, ROOT, TINY
-from torchrl_etl.analysis.bench_results import COLUMNS
-from torchrl_etl.training import Bench, Run
+from torchrl_etl.analysis.sweep_results import COLUMNS
+from torchrl_etl.training import Run, Sweep
 
 SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=", "threads="))]
 SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]
 
 
 def command(out: Path, *overrides: str) -> list[str]:
-    recipe = [sys.executable, str(ROOT / "recipes" / "bench.py")]
+    recipe = [sys.executable, str(ROOT / "recipes" / "sweep.py")]
     common = ["tasks=[overactuated]", "frames=900", f"settings={' '.join(SMALL)}", f"out={out}"]
     return [*recipe, *common, *overrides]
 
@@ -46,7 +46,7 @@ def small_run(tmp_path: Path, text: str) -> Run:
 
 @pytest.mark.slow
 def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
-    out = tmp_path / "a bench"
+    out = tmp_path / "a sweep"
     arguments = command(out, "methods=[sac,etl]", "seeds=[0]", "jobs=2")
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     first = out / "overactuated-sac-seed0" / "checkpoints" / "learn"
@@ -77,10 +77,10 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
 
 def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
     run = small_run(tmp_path, "print('it broke'); raise SystemExit(3)")
-    bench = Bench([run], tmp_path / "out", jobs=1, attempts=2)
-    for _ in bench:
+    sweep = Sweep([run], tmp_path / "out", jobs=1, attempts=2)
+    for _ in sweep:
         pass
-    assert bench.status(run) == "failed" and run.starts == 2
+    assert sweep.status(run) == "failed" and run.starts == 2
     assert (run.path / "log.txt").read_text().count("it broke") == 2
 
 
@@ -88,10 +88,10 @@ def test_a_finished_run_is_left_alone(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     run.path.mkdir(parents=True)
     (run.path / "summary.json").write_text("{}")
-    bench = Bench([run], tmp_path / "out", jobs=1)
-    for _ in bench:
+    sweep = Sweep([run], tmp_path / "out", jobs=1)
+    for _ in sweep:
         pass
-    assert bench.status(run) == "finished" and run.starts == 0
+    assert sweep.status(run) == "finished" and run.starts == 0
 
 
 def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
@@ -102,8 +102,8 @@ def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
     lines = [COLUMNS, (row | {"status": "finished"}).values(), other.values()]
     text = "".join(",".join(line) + "\n" for line in lines)
     (tmp_path / "out" / "results.csv").write_text(text)
-    bench = Bench([run], tmp_path / "out", jobs=1)
-    for _ in bench:
+    sweep = Sweep([run], tmp_path / "out", jobs=1)
+    for _ in sweep:
         pass
     assert run.starts == 0
     assert (tmp_path / "out" / "results.csv").read_text() == text
@@ -111,20 +111,20 @@ def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
 
 def test_runs_end_with_the_queue(tmp_path):
     run = small_run(tmp_path, "import time; time.sleep(600)")
-    bench = Bench([run], tmp_path / "out", jobs=1)
-    next(iterator := iter(bench))
-    assert bench.status(run) == "running"
+    sweep = Sweep([run], tmp_path / "out", jobs=1)
+    next(iterator := iter(sweep))
+    assert sweep.status(run) == "running"
     iterator.close()
     assert run.process.poll() is not None
 
 
 def test_two_queues_do_not_work_in_one_folder(tmp_path):
-    bench = Bench([], tmp_path / "out", jobs=1)
-    other = f"from torchrl_etl.training import Bench; Bench([], {str(tmp_path / 'out')!r}, jobs=1)"
+    sweep = Sweep([], tmp_path / "out", jobs=1)
+    other = f"from torchrl_etl.training import Sweep; Sweep([], {str(tmp_path / 'out')!r}, jobs=1)"
     environ = os.environ | {"PYTHONPATH": str(ROOT)}
     ended = subprocess.run([sys.executable, "-c", other], capture_output=True, env=environ)
     assert b"Another queue works in" in ended.stderr
-    bench.stop()
+    sweep.stop()
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_two_queues_do_not_work_in_one_folder(tmp_path):
 )
 def test_a_mistake_is_told_before_anything_runs(override, words, recipe):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("bench", [override])
+        config = compose("sweep", [override])
     with pytest.raises((ValueError, HydraException), match=words):
         recipe.queue(config)
 
@@ -170,7 +170,7 @@ def test_a_queue_takes_a_task_of_one_s_own_and_its_random_goal(recipe, tmp_path,
     monkeypatch.syspath_prepend(tmp_path)
     tasks = "queue_tasks:QueueReach-v0,queue_tasks:QueueReachRandom-v0:random"
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("bench", [f"tasks=[{tasks}]", "methods=[sac]", "seeds=[0]"])
+        config = compose("sweep", [f"tasks=[{tasks}]", "methods=[sac]", "seeds=[0]"])
     fixed, random = recipe.queue(config)
     assert (fixed.task, fixed.goal) == ("queue_tasks:QueueReach-v0", None)
     assert (random.task, random.goal) == ("queue_tasks:QueueReachRandom-v0", "random")
@@ -188,8 +188,8 @@ def test_a_misspelt_setting_is_answered_with_the_nearest(tmp_path):
 
 @pytest.fixture(scope="module")
 def recipe():
-    """recipes/bench.py as a module."""
-    spec = importlib.util.spec_from_file_location("bench_recipe", ROOT / "recipes" / "bench.py")
+    """recipes/sweep.py as a module."""
+    spec = importlib.util.spec_from_file_location("sweep_recipe", ROOT / "recipes" / "sweep.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

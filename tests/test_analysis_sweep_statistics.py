@@ -9,8 +9,8 @@ import pytest
 from rliable import metrics
 from scipy.stats import trim_mean
 
-from tests.bench_rows import FEW, bench, run
-from torchrl_etl.analysis.bench_statistics import (
+from tests.sweep_rows import FEW, run, sweep
+from torchrl_etl.analysis.sweep_statistics import (
     Scale,
     common_budget,
     compare,
@@ -90,14 +90,14 @@ def test_band_is_an_interval_of_the_mean_from_three_seeds_up():
 def test_budget_is_the_most_that_all_runs_share(tmp_path):
     sac = run([0, 1, 2], [0, 50_000, 100_000])
     etl = run([0, 3, 5, 6], [0, 49_900, 99_000, 150_000], method="etl")
-    runs = bench(tmp_path, sac, etl).runs
+    runs = sweep(tmp_path, sac, etl).runs
     assert common_budget(runs) == 100_000
     comparison = compare(runs, ["sac", "etl"], "sac", repetitions=FEW)
     assert comparison.result("etl").returns.tolist() == [5.0]
     assert comparison.result("etl").improvement == 1.0
     assert comparison.result("sac").improvement is None and not comparison.stale
     # A grid that never meets the other's: the last evaluation counts, and is named.
-    runs = bench(tmp_path, sac, run([0, 4, 8], [0, 30_000, 80_000], method="etl")).runs
+    runs = sweep(tmp_path, sac, run([0, 4, 8], [0, 30_000, 80_000], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", repetitions=FEW)
     assert comparison.budget == 80_000 and comparison.result("sac").returns.tolist() == [1.0]
     assert [one.method for one in comparison.stale] == ["sac"]
@@ -107,7 +107,7 @@ def test_a_batch_more_or_less_at_the_end_changes_nothing(tmp_path):
     sac = run([0, 1, 2], [0, 45_056, 50_048])
     sar = run([0, 3, 4], [0, 45_064, 50_056], method="sar")
     late = run([0, 5, 6], [0, 49_000, 50_600], method="etl")
-    runs = bench(tmp_path, sac, sar, late).runs
+    runs = sweep(tmp_path, sac, sar, late).runs
     for frames in (50_000, None):
         comparison = compare(runs, ["sac", "sar", "etl"], "sac", frames=frames, repetitions=FEW)
         assert comparison.budget == (frames or 50_048)
@@ -118,7 +118,7 @@ def test_a_batch_more_or_less_at_the_end_changes_nothing(tmp_path):
 
 
 def test_runs_that_end_before_an_asked_budget_are_left_out(tmp_path):
-    runs = bench(tmp_path, run([0, 1, 2, 3]), run([0, 5], method="etl")).runs
+    runs = sweep(tmp_path, run([0, 1, 2, 3]), run([0, 5], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", frames=150_000, repetitions=FEW)
     assert comparison.result("etl") is None
     assert [one.method for one in comparison.short] == ["etl"]
@@ -126,7 +126,7 @@ def test_runs_that_end_before_an_asked_budget_are_left_out(tmp_path):
 
 def test_frames_to_the_controls_return_are_those_of_the_mean_over_seeds(tmp_path):
     frames = [0, 10, 20, 30]
-    results = bench(
+    results = sweep(
         tmp_path,
         run([0, 1, 5, 4], frames, seed=0),
         run([0, 1, 3, 2], frames, seed=1),  # sac ends at a mean of 3
@@ -146,7 +146,7 @@ def test_unequal_seeds_and_missing_tasks(tmp_path):
     turn = [run([-100, 0, 2211.99], method="sac", seed=s) for s in (0, 1, 2)]
     better = [run([-100, 0, 2211.99 + 2311.99], method="etl", seed=s) for s in (0, 1)]
     walk = [run([-50, 0, 50], task="myoLegWalk", seed=s) for s in (0, 1)]
-    results = bench(tmp_path, *turn, *better, *walk)
+    results = sweep(tmp_path, *turn, *better, *walk)
     comparisons = [
         compare(
             [one for one in results.runs if one.setting == setting],
@@ -170,5 +170,5 @@ def test_a_task_without_a_sound_scale_says_why(tmp_path):
     other = run([0, 1, 2], task="myoLegWalk", method="etl")
     worse = run([0, -1, -2], task="myoRelocate")
     for rows, words in ((other, "sac lacks the task"), (worse, "is not above the untrained")):
-        comparison = compare(bench(tmp_path, rows).runs, ["sac", "etl"], "sac", repetitions=FEW)
+        comparison = compare(sweep(tmp_path, rows).runs, ["sac", "etl"], "sac", repetitions=FEW)
         assert words in normalize(comparison, "sac")

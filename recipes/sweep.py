@@ -1,0 +1,147 @@
+"""Every method on every task with every seed: a queue that survives anything, and one table.
+
+    python recipes/sweep.py tasks=[myoHandPose] methods=[sac,etl] seeds=[0,1] frames=50000
+    python recipes/report.py results=sweep
+
+Kill it at any time and start it again: finished runs stay, others go on from their checkpoints.
+Every evaluation is a row of results.csv. These are all settings, with their defaults:
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, ListConfig
+from rich.live import Live
+from rich.table import Table
+
+from torchrl_etl.checks import check_choice
+from torchrl_etl.collectors import STOP_SIGNALS
+from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
+from torchrl_etl.training import Run, Sweep, validate
+
+HERE = Path(__file__).parent
+CONF = HERE / "conf"
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="sweep")
+def main(config: DictConfig) -> None:
+    with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
+        runs = queue(config)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        sweep = Sweep(runs, Path(config.out), jobs=config.jobs or cores, attempts=config.attempts)
+    display = Display(sweep)
+    for number in STOP_SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.default_int_handler)
+    try:
+        with Live(display.table(), refresh_per_second=1) as live:
+            for _ in sweep:
+                live.update(display.table())
+    except KeyboardInterrupt:
+        print("Stopped; all runs are saved. Start it again to go on.")
+        sys.exit(130)
+    failed = [run for run in runs if sweep.status(run) == "failed"]
+    for run in failed:
+        lines = (run.path / "log.txt").read_text(encoding="utf-8").splitlines()
+        last = next((line for line in reversed(lines) if line.strip()), "no message")
+        print(f"Failed: {run.name}, {last} (all of it in {run.path / 'log.txt'})", file=sys.stderr)
+    print(f"Evaluations: {sweep.folder / 'results.csv'}")
+    sys.exit(1 if failed else 0)
+
+
+def queue(config: DictConfig) -> list[Run]:
+    """The runs that a configuration asks for, seed by seed, so that early results compare."""
+    methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+    for name in ("tasks", "methods", "seeds"):
+        value = config[name]
+        if not isinstance(value, ListConfig) or not value:
+            raise ValueError(f"{name} is {value!r}; it must be a list, such as {name}=[a,b].")
+    for method in config.methods:
+        check_choice("methods", method, methods)
+    for name in ("frames", "attempts"):
+        if not isinstance(config[name], int) or config[name] < 1:
+            raise ValueError(f"{name} is {config[name]!r}; it must be a whole number above 0.")
+    folder = Path(config.out).resolve()
+    runs = []
+    for seed, task, method in product(config.seeds, config.tasks, config.methods):
+        name, goal = split_goal(str(task))
+        overrides = [f"env={name}", f"method={method}", f"seed={seed}", f"frames={config.frames}"]
+        overrides += [f"goal={goal}"] if goal else []
+        overrides += [
+            "threads=1",
+            "progress=false",
+            "pictures=false",
+            "log=[]",
+            *shlex.split(config.settings),
+        ]
+        path = folder / "-".join(
+            filter(None, (name.replace(":", "-"), goal, method, f"seed{seed}"))
+        )
+        command = [str(HERE / "etl_sac.py"), *overrides]
+        runs.append(Run(name, goal or None, method, seed, path, command))
+        validate(compose(overrides))  # every one of them, before the first begins
+    return runs
+
+
+def split_goal(task: str) -> tuple[str, str]:
+    """``TASK:random`` is a task and its goal; ``module:id``, of one's own, is a task."""
+    name, _, goal = task.rpartition(":")
+    return (name, goal) if goal in ("fixed", "random") else (task, "")
+
+
+def compose(overrides: Sequence[str]) -> DictConfig:
+    """What ``etl_sac.py`` would make of these."""
+    hydra.core.global_hydra.GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        return hydra.compose("config", [*translate(overrides, CONF), "run_dir=unused"])
+
+
+class Display:
+    """A live table: where each run is, how it does, and how long it will take."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        self.sweep = sweep
+        self.begun: dict[str, tuple[int, float]] = {}
+
+    def table(self) -> Table:
+        table = Table("run", "status", "frames", "return", "solved", "time left")
+        table.columns[0].overflow = "fold"
+        for run in self.sweep.runs:
+            status, folder = self.sweep.status(run), run.folder
+            cells = [run.name, status]
+            if folder is None:
+                table.add_row(*cells)
+                continue
+            stages = ("explore", "play", "learn")
+            frames = max(folder.series(f"{stage}/updates")[0][-1:] for stage in stages)
+            done, returns = (frames or [0])[0], folder.series("learn/eval/return")[1]
+            solved = folder.series("learn/eval/solved")[1]
+            cells += [f"{done:,}", f"{returns[-1]:.1f}" if returns else ""]
+            cells += [f"{solved[-1]:.0%}" if solved else ""]
+            cells += [self.time_left(run, done) if status == "running" else ""]
+            table.add_row(*cells)
+        return table
+
+    def time_left(self, run: Run, done: int) -> str:
+        total = int(next(o for o in run.command if o.startswith("frames=")).partition("=")[2])
+        first, since = self.begun.setdefault(run.name, (done, time.monotonic()))
+        if done <= first:
+            return "?"
+        minutes = (total - done) * (time.monotonic() - since) / (done - first) / 60
+        return f"{minutes:.0f} min" if minutes >= 1 else "< 1 min"
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = quote_paths(sys.argv[1:], "out", "settings")
+    check_overrides(CONF / "sweep.yaml", sys.argv[1:], __doc__)
+    main()
