@@ -13,7 +13,7 @@ from harness import recipe
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import Stage
 
 

@@ -37,7 +37,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import make_actor, make_critic
 from torchrl_etl.training import Stage
 

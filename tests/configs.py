@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.command_line import translate
 
@@ -42,9 +43,16 @@ RESIDUAL = (
 )
 
 
-def tiny(*overrides: str, name: str = "config") -> DictConfig:
-    """The tiny configuration with overrides."""
-    of_networks = {"synergies=pca", "synergies=nmf"}.isdisjoint(overrides)
-    small = [key for key in TINY if of_networks or not key.startswith("synergies.")]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(name, overrides=translate([*small, *overrides], CONF))
+def tiny(*overrides: str, name: str = "config", conf: Path = CONF) -> DictConfig:
+    """The tiny configuration with overrides, of those settings that the chosen kinds have."""
+    small = [setting for setting in TINY if _is_there(setting, overrides, conf)]
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        return compose(name, overrides=translate([*small, *overrides], conf))
+
+
+def _is_there(setting: str, overrides: Sequence[str], conf: Path) -> bool:
+    section, _, key = setting.partition("=")[0].partition(".")
+    chosen = [value for name, _, value in (o.partition("=") for o in overrides) if name == section]
+    if not key or not chosen or not (file := conf / section / f"{chosen[-1]}.yaml").is_file():
+        return True
+    return OmegaConf.select(OmegaConf.load(file), key) is not None

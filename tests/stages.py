@@ -7,7 +7,7 @@ from torch import nn
 
 from tests.configs import tiny
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 
 

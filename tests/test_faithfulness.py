@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tests.configs import CONF, ROOT
 from tests.stages import explorer, fill
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 
 PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")
 TEST = re.compile(r"(tests/\w+\.py)::(\w+)")
@@ -102,7 +102,7 @@ def test_every_setting_on_the_page_is_accepted_as_written(setting):
 def test_the_paper_preset_reaches_the_parts_it_is_about():
     paper = explored("faithful=paper")
     paper.stage.update()
-    relabel, bonus = paper.exploration.batch_transforms()
+    (relabel,), (bonus,) = paper.relabel, paper.exploration.batch_transforms()
     assert bonus.deviation is None
     assert paper.stage.learner.objective.terms[0].loss.regularizer == "literal"
     assert relabel.share == 0

@@ -8,7 +8,7 @@ import torch
 from tests.configs import tiny
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
 

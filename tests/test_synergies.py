@@ -11,7 +11,7 @@ from tests.configs import tiny
 from tests.stages import explorer
 from torchrl_etl.analysis import describe_synergies, draw_synergies, variance_accounted_for
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.synergies import (
     SYNERGY_MODELS,
     SynergyModel,

@@ -22,7 +22,7 @@ from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.methods import etl
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests

@@ -13,7 +13,7 @@ from tests.configs import RESIDUAL, tiny
 from tests.stages import changed, explorer, fill, learn_stage, snapshot
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.etl import Explorer
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
 

@@ -46,6 +46,10 @@ class EnvironmentSpec(NamedTuple):
         return self.action_spec.shape[-1]
 
     @property
+    def device(self) -> torch.device:
+        return self.action_spec.device
+
+    @property
     def low(self) -> torch.Tensor:
         return self.action_spec.space.low
 

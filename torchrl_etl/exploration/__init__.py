@@ -1,6 +1,6 @@
 """Ways for stage 1 to explore, one a file."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.exploration.exploration import Exploration
@@ -15,7 +15,8 @@ __all__ = [
     "MetricExploration",
 ]
 
-EXPLORATIONS: Mapping[str, Callable[..., Exploration]] = {
+EXPLORATIONS: Mapping[str, type[Exploration]] = {
     "metric": MetricExploration,
     "metra": METRAExploration,
 }
+"""Kinds of exploration by name; ``"my_module:MyExploration"`` names one's own."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_real
+from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.modules import StateEncoder
 from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, RedrawDirection
@@ -27,7 +28,7 @@ class DirectionExploration(Exploration):
     Equation: 1, r^b = ⟨φ(s') - φ(s), z⟩.
 
     Args:
-        observation_dim (int): size of an observation.
+        spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Keyword Args:
         encoder, direction, bonus (mapping): keyword arguments of
@@ -36,7 +37,6 @@ class DirectionExploration(Exploration):
             :class:`~torchrl_etl.transforms.IntrinsicReward`.
         relabel (float): share of each batch that is relabelled with a direction drawn anew, see
             :class:`~torchrl_etl.transforms.RedrawDirection`.
-        device (torch.device): of φ. Default: the CPU.
     """
 
     reward = "intrinsic_reward"
@@ -44,29 +44,29 @@ class DirectionExploration(Exploration):
 
     def __init__(
         self,
-        observation_dim: int,
+        spec: EnvironmentSpec,
         *,
         encoder: Mapping[str, Any],
         direction: Mapping[str, Any],
         bonus: Mapping[str, Any],
         relabel: float = 1.0,
-        device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__()
+        super().__init__(spec)
         check_real("[0, 1]", relabel=relabel)
-        self.encoder = StateEncoder(observation_dim, **encoder).to(device)
+        self.encoder = StateEncoder(spec.observation_dim, **encoder).to(spec.device)
         self.inputs = {"direction": self.encoder.embedding_dim}
         self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)
-        self._batch_transforms = (
-            RedrawDirection(self.primer.clone(), share=relabel),
-            IntrinsicReward(self.encoder, **bonus),
-        )
+        self._redraw = RedrawDirection(self.primer.clone(), share=relabel)
+        self._bonus = IntrinsicReward(self.encoder, **bonus)
 
     def reset_transforms(self) -> Sequence[Transform]:
         return (self.primer,)
 
+    def relabel_transforms(self) -> Sequence[Transform]:
+        return (self._redraw,)
+
     def batch_transforms(self) -> Sequence[Transform]:
-        return self._batch_transforms
+        return (self._bonus,)
 
     @torch.no_grad()
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor]:

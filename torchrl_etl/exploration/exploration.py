@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
+from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.learners.term import Term
 
 __all__ = ["Exploration"]
@@ -19,8 +20,10 @@ class Exploration:
     """A way to explore: what is drawn at reset, what a sampled batch gets, what is trained.
 
     This one is SAC on the task's reward, without anything added. Others override what differs, in
-    a file of their own, and put themselves into
-    :data:`~torchrl_etl.exploration.EXPLORATIONS`.
+    a file of their own that a configuration names by its kind; ``docs/extend.md`` adds one.
+
+    Args:
+        spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Attributes:
         reward (NestedKey): what SAC learns on in stage 1, below ``"next"``.
@@ -32,24 +35,31 @@ class Exploration:
     keep: Sequence[NestedKey] = ()
     inputs: Mapping[str, int]
 
-    def __init__(self) -> None:
+    def __init__(self, spec: EnvironmentSpec) -> None:
         self.inputs = {}
 
     def reset_transforms(self) -> Sequence[Transform]:
         """For the environment: they draw what holds for an episode. Each simulator gets clones."""
         return ()
 
+    def relabel_transforms(self) -> Sequence[Transform]:
+        """For the buffer: they draw what the policy reads anew in each sampled batch."""
+        return ()
+
     def batch_transforms(self) -> Sequence[Transform]:
-        """For the buffer: they see each sampled batch, with all networks as they are by then."""
+        """For the buffer, behind those that relabel: what else a sampled batch gets.
+
+        They see each sampled batch, with all networks as they are by then.
+        """
         return ()
 
     def terms(self) -> Sequence[Term]:
         """Losses that train a representation beside the policy."""
         return ()
 
-    def behavior(self, actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
-        """The policy that collects."""
-        return actor
+    def behavior(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
+        """What collects, given the actor with its noise."""
+        return policy
 
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor] | None:
         """Embeddings [*, k] and directions [*, k] of observations, if it has any."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_etl.checks import check_real
+from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
 from torchrl_etl.objectives import METRALoss
@@ -19,7 +20,7 @@ class METRAExploration(DirectionExploration):
     Equation: see :class:`~torchrl_etl.objectives.METRALoss`.
 
     Args:
-        observation_dim (int): size of an observation.
+        spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Keyword Args:
         lr (float): learning rate of φ and of the multiplier.
@@ -28,9 +29,9 @@ class METRAExploration(DirectionExploration):
     """
 
     def __init__(
-        self, observation_dim: int, *, lr: float, metra: Mapping[str, Any], **directions: Any
+        self, spec: EnvironmentSpec, *, lr: float, metra: Mapping[str, Any], **directions: Any
     ) -> None:
-        super().__init__(observation_dim, **directions)
+        super().__init__(spec, **directions)
         check_real("(0, inf)", lr=lr)
         self._lr, self._metra = lr, dict(metra)
 

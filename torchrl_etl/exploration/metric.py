@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchrl_etl.checks import check_flag, check_real
+from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import GaussianDynamics
@@ -20,7 +21,7 @@ class MetricExploration(DirectionExploration):
     Equation: 2, 3, 5 and 6, see :class:`~torchrl_etl.objectives.BehavioralMetricLoss`.
 
     Args:
-        observation_dim (int): size of an observation.
+        spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Keyword Args:
         lr (float): learning rate of φ.
@@ -31,14 +32,14 @@ class MetricExploration(DirectionExploration):
 
     def __init__(
         self,
-        observation_dim: int,
+        spec: EnvironmentSpec,
         *,
         lr: float,
         tau: float,
         metric: dict[str, Any],
         **directions: Any,
     ) -> None:
-        super().__init__(observation_dim, **directions)
+        super().__init__(spec, **directions)
         check_real("(0, inf)", lr=lr)
         check_real("(0, 1]", tau=tau)
         check_flag(**{"metric.delay_encoder": metric.get("delay_encoder", True)})

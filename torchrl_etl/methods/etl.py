@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import safetensors.torch
-import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import nn
 
 from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real, naming
 from torchrl_etl.envs import resolve_task
-from torchrl_etl.exploration import EXPLORATIONS, Exploration
 from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term
+from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import (
@@ -27,13 +25,12 @@ from torchrl_etl.modules.bundle import (
     save_bundle,
 )
 from torchrl_etl.objectives import DecoderLoss
-from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
 
-__all__ = ["ETL", "Explorer", "FineTuning"]
+__all__ = ["ETL", "FineTuning"]
 
 FineTuning = Literal["critic", "reconstruction", "frozen"]
 MOST_SYNERGIES = 8
@@ -48,89 +45,6 @@ def default_num_synergies(actuators: int) -> int:
         [1, 3, 8, 8]
     """
     return min(MOST_SYNERGIES, max(1, actuators // 2))
-
-
-class Explorer:
-    """Stage 1: an exploration, a learner that is paid for it, and a synergy model beside it.
-
-    Every update draws one batch. Its bonus is computed as it is drawn, with the representation as
-    it then is; the policy, the representation and the synergy model learn from it side by side.
-
-    Deviates: after the last frame the synergy model is trained on for ``final_updates``; Algorithm
-    1 stops with the last frame (0).
-
-    Attributes:
-        exploration (Exploration): see there.
-        model (SynergyModel): see there.
-        stage (Stage): stage 1.
-    """
-
-    def __init__(self, context: Context) -> None:
-        fit = dict(context.options("explore")["fit"])
-        self.final_updates = fit.pop("final_updates")
-        context.seed_everything("explore")
-        self.exploration = make_exploration(context)
-        self.model = make_synergy_model(context)
-        for transform in (batch_transforms := self.exploration.batch_transforms()):
-            transform.to(context.device)
-
-        def more(actor):
-            with naming("fit"):
-                self.shown = ShownActions(actor, **fit)
-            terms = list(self.exploration.terms())
-            self.term = None
-            if self.model.loss is not None:
-                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)
-                terms.append(self.term)
-            return {"terms": terms, "reward": self.exploration.reward}
-
-        learner = context.learner(
-            "explore",
-            inputs=self.exploration.inputs,
-            make_behavior=self.exploration.behavior,
-            more=more,
-        )
-        env_options = {"activations": True} if fit["actions"] == "activation" else {}
-        self.stage = context.stage(
-            learner,
-            "explore",
-            env_options=env_options,
-            env_transforms=self.exploration.reset_transforms(),
-            transforms=batch_transforms,
-            keep=(*self.exploration.keep, *self.shown.keep),
-        )
-        self.seed = self.stage.seed
-
-    def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
-        """Train the synergy model to the end; returns the decoder for stage 2.
-
-        Keyword Args:
-            on_update (callable): called before every update; may raise to stop.
-        """
-        torch.manual_seed(self.seed)  # the same whether or not the run was resumed
-        if self.term is None:
-            self.model.fit(self.actions(), on_update=on_update)
-        for _ in range(self.final_updates if self.term is not None else 0):
-            on_update()
-            self.stage.learner.update_term(self.term, self.stage.buffer.sample())
-        return self.model.decoder(self.actions())
-
-    def actions(self, count: int = 20_000) -> torch.Tensor:
-        """Up to ``count`` of the latest actions that the synergy model is shown [N, n]."""
-        rows = self.stage.newest(count).to(self.stage.device)
-        for transform in self.stage.transforms[:1]:  # relabelled, as in a batch
-            rows = transform(rows)
-        return self.shown(rows)["action"]
-
-    def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
-        """All that was explored as stage 2 has it: the task's reward, and each executed action with
-        the coefficients that come nearest to it.
-        """
-        rows = self.stage.newest(self.stage.budget)
-        kept = rows.select("observation", "action", ("next", "observation"))
-        kept["next"].update(rows["next"].select("done", "terminated"))
-        kept["next", "reward"] = rows["next", "reward"] / self.stage.reward_scale
-        return kept.set("synergy", decoder.encode(rows["action"]))
 
 
 class ETL(Method):
@@ -330,44 +244,3 @@ class ETL(Method):
         missing = decoder.synergy_dim - rows["synergy"].shape[-1]
         rows["synergy"] = nn.functional.pad(rows["synergy"], (0, missing))
         return rows.to(self.context.device)
-
-
-_OTHER_OPTIONS = ("unexpected keyword argument", "required keyword-only argument")
-
-
-def make_exploration(context: Context) -> Exploration:
-    options = context.options("exploration")
-    inputs = (context.spec.observation_dim,)
-    return _make("exploration", EXPLORATIONS, inputs, device=context.device, **options)
-
-
-def make_synergy_model(
-    context: Context, num_synergies: int | None = None, **options: Any
-) -> SynergyModel:
-    options = {**context.options("synergies"), **options}
-    options.pop("bundle")
-    number = context.config.num_synergies if num_synergies is None else num_synergies
-    inputs = (context.spec.low, context.spec.high, number)
-    return _make("synergies", SYNERGY_MODELS, inputs, **options)
-
-
-def _make(
-    section: str,
-    kinds: Mapping[str, Callable[..., Any]],
-    inputs: tuple,
-    *,
-    kind: str,
-    **options: Any,
-) -> Any:
-    """One of ``kinds`` with the options of its section of the configuration."""
-    check_choice(f"{section}.kind", kind, list(kinds))
-    try:
-        with naming(section):
-            return kinds[kind](*inputs, **options)
-    except TypeError as error:
-        if not any(fault in str(error) for fault in _OTHER_OPTIONS):
-            raise
-        raise ValueError(
-            f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
-            f"choose {section}={kind}, which brings its own."
-        ) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchrl_etl.checks import check_positive
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
-from torchrl_etl.modules.synergy_decoder import percentile_box
+from torchrl_etl.modules.synergy_decoder import NEAREST, percentile_box
 from torchrl_etl.synergies.model import SynergyModel
 
 __all__ = ["AffineSynergies"]
@@ -37,6 +38,8 @@ class AffineSynergies(SynergyModel):
     """
 
     basis: Tensor | None = None
+    highest: ClassVar[float] = NEAREST
+    """As far up as a muscle may be in the middle of the box, where the bounds are ±1."""
 
     def __init__(self, low: Tensor, high: Tensor, num_synergies: int) -> None:
         check_positive(num_synergies=num_synergies)
@@ -83,7 +86,9 @@ class AffineSynergies(SynergyModel):
 
     def inside(self, center: Tensor) -> Tensor:
         """The action [n] in the middle of the box, brought inside the bounds if need be."""
-        return center
+        half = (self.high - self.low) / 2
+        unit = (center - self.low) / half - 1
+        return self.low + half * (unit.clamp(-NEAREST, self.highest) + 1)
 
     def reconstruct(self, actions: Tensor) -> Tensor:
         self._check_fitted()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from torchrl_etl.checks import check_choice
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
+from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies.gmvae import GMVAESynergies
 from torchrl_etl.synergies.model import SynergyModel
 from torchrl_etl.synergies.nmf import NMFSynergies
@@ -18,15 +18,15 @@ from torchrl_etl.synergies.vae import VAESynergies
 
 __all__ = ["SYNERGY_MODELS", "fit_synergies"]
 
-SYNERGY_MODELS: dict[str, Callable[..., SynergyModel]] = {
+SYNERGY_MODELS: Mapping[str, type[SynergyModel]] = {
     model.kind: model for model in (GMVAESynergies, VAESynergies, PCASynergies, NMFSynergies)
 }
-"""Kinds of synergies by name."""
+"""Kinds of synergies by name; ``"my_module:MySynergies"`` names one's own."""
 
 
 def fit_synergies(
     actions: Tensor | np.ndarray | Sequence[Any],
-    kind: str = "gmvae",
+    kind: str | type[SynergyModel] = "gmvae",
     num_synergies: int = 4,
     *,
     low: float | Sequence[float] | Tensor = -1.0,
@@ -37,8 +37,9 @@ def fit_synergies(
 
     Args:
         actions (array): [N, n] between the bounds: a tensor, a NumPy array or lists.
-        kind (str): ``"gmvae"``, ``"vae"``, ``"pca"`` or ``"nmf"``; see
-            :data:`~torchrl_etl.synergies.SYNERGY_MODELS`.
+        kind (str or type): ``"gmvae"``, ``"vae"``, ``"pca"`` or ``"nmf"``, see
+            :data:`~torchrl_etl.synergies.SYNERGY_MODELS`; a model of one's own is its class, or
+            ``"my_module:MySynergies"``.
         num_synergies (int): d, at most n.
 
     Keyword Args:
@@ -65,13 +66,14 @@ def fit_synergies(
         >>> model.decoder(emg).action_dim
         12
     """
-    check_choice("kind", kind, list(SYNERGY_MODELS))
+    if not isinstance(kind, type):
+        kind = find_class(kind, SYNERGY_MODELS, SynergyModel)
     try:
         width = np.shape(actions)[-1]
     except (ValueError, IndexError):  # ragged lists or a number: refused by as_actions
         width = 1
     low, high = as_bounds(low, high, width)
     found = as_actions(actions, low=low, high=high, min_rows=2)
-    model = SYNERGY_MODELS[kind](low, high, num_synergies, **options)
+    model = kind(low, high, num_synergies, **options)
     model.fit(found)
     return model

@@ -17,9 +17,8 @@ __all__ = ["SynergyModel"]
 class SynergyModel(ABC):
     """Condenses actions of n actuators into d coefficients.
 
-    A subclass is a file of its own and an entry of
-    :data:`~torchrl_etl.synergies.SYNERGY_MODELS`. It is built from the
-    bounds of the action: ``Model(low, high, num_synergies, **options)``.
+    A subclass is a file of its own that a configuration names by its kind; ``docs/extend.md`` adds
+    one. It is built from the bounds of the action: ``Model(low, high, num_synergies, **options)``.
 
     Attributes:
         kind (str): its name in configurations and bundles.

@@ -11,14 +11,9 @@ import torch
 from torch import Tensor
 
 from torchrl_etl.checks import check_positive
-from torchrl_etl.modules.synergy_decoder import NEAREST
 from torchrl_etl.synergies.affine import AffineSynergies
 
 __all__ = ["NMFSynergies"]
-
-# As far up as a muscle may be in the middle of the box: beyond, its slope before the bounds is so
-# steep that a small coefficient throws it from one bound to the other.
-_HIGHEST = 0.9
 
 
 class NMFSynergies(AffineSynergies):
@@ -48,6 +43,9 @@ class NMFSynergies(AffineSynergies):
     """
 
     kind = "nmf"
+    # Beyond, the slope before the bounds is so steep that a small coefficient throws a muscle from
+    # one bound to the other.
+    highest = 0.9
 
     def __init__(
         self, low: Tensor, high: Tensor, num_synergies: int, *, max_iter: int = 500
@@ -76,11 +74,6 @@ class NMFSynergies(AffineSynergies):
 
     def compose(self, coefficients: Tensor) -> Tensor:
         return self.low + coefficients @ self.basis
-
-    def inside(self, center: Tensor) -> Tensor:
-        half = (self.high - self.low) / 2
-        unit = (center - self.low) / half - 1
-        return self.low + half * (unit.clamp(-NEAREST, _HIGHEST) + 1)
 
     def _above_low(self, actions: np.ndarray) -> np.ndarray:
         return (actions - self.low.cpu().double().numpy()).clip(min=0.0)

@@ -53,6 +53,9 @@ class PCASynergies(AffineSynergies):
         unit = (self.mean + coefficients @ self.basis).tanh()
         return self.low + (unit + 1) / 2 * (self.high - self.low)
 
+    def inside(self, center: Tensor) -> Tensor:
+        return center  # as it is: the decoder then is the model itself
+
     def _before_bounds(self, actions: Tensor) -> Tensor:
         low, high = self.low.to(actions), self.high.to(actions)
         return (2 * (actions - low) / (high - low) - 1).clamp(-NEAREST, NEAREST).atanh()

@@ -1,0 +1,121 @@
+"""docs/extend.md: its files run as they stand, and a kind of one's own that cannot run says why."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+
+import pytest
+import torch
+
+from tests.configs import CONF, ROOT, tiny
+from tests.runs import killed_when_saved, numbers
+from tests.stages import changed, snapshot
+from torchrl_etl.command_line import check_overrides, translate
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.explorer import Explorer
+from torchrl_etl.synergies import fit_synergies, load_bundle
+from torchrl_etl.training import resumed_config
+
+PAGE = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```$", PAGE, re.S | re.M))
+MODULES = ("curiosity", "at_random", "recordings")
+BRIEF = ("explore.frames=256", "learn.frames=64", "checkpoint.every=128", "evaluation.episodes=1")
+OWN = ("exploration=curiosity", "synergies=random")
+
+
+@pytest.fixture
+def conf(tmp_path, monkeypatch):
+    """The page's files in a folder of their own, which is the current one."""
+    shutil.copytree(CONF, tmp_path / "recipes" / "conf")
+    for name, content in FILES.items():
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield tmp_path / "recipes" / "conf"
+    for module in MODULES:
+        sys.modules.pop(module, None)
+
+
+def test_the_page_has_one_short_python_file_and_one_yaml_file_for_each():
+    python = {name: code for name, code in FILES.items() if name.endswith(".py")}
+    assert set(python) == {f"{module}.py" for module in MODULES}
+    assert set(FILES) - set(python) == {
+        "recipes/conf/exploration/curiosity.yaml",
+        "recipes/conf/synergies/random.yaml",
+    }
+    for name, code in python.items():
+        assert sum(bool(line.strip()) for line in code.splitlines()) < 40, name
+
+
+def test_both_stages_run_with_the_toys(conf, tmp_path):
+    settings = ("learn.prefill=true", "learn.decoder.residual=0.5", *BRIEF)
+    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings, conf=conf)).run()
+    assert summary["learn"]["frames"] == 64
+    assert load_bundle(tmp_path / "run")[1].kind == "random"
+
+
+def test_stage_1_of_the_toys_goes_on_after_a_kill_with_the_same_numbers(conf, tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    settings = (*OWN, *BRIEF, "stage=explore")
+    Experiment(tiny(f"run_dir='{whole}'", *settings, conf=conf)).run()
+    killed_when_saved(broken, 128, *settings, conf=conf)
+    Experiment(resumed_config(broken), resume=broken).run()
+    assert numbers(broken) == numbers(whole)
+
+
+def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(conf):
+    found = Explorer(Experiment(tiny("run_dir=unused", *OWN, conf=conf)).context)
+    found.stage.restart_collection()
+    for _ in range(6):
+        found.stage.collect()
+    batch, loss = found.stage.buffer.sample(), found.exploration.loss
+    inputs = torch.cat([batch["observation"], batch["action"]], -1)
+    error = (loss.model(inputs) - batch["next", "observation"]).square().sum(-1, keepdim=True)
+    torch.testing.assert_close(batch["next", "surprise"], error)
+    before = snapshot(loss), snapshot(found.stage.learner.behavior)
+    found.stage.update()
+    assert changed(loss, before[0]) and changed(found.stage.learner.behavior, before[1])
+    found.stage.close()
+
+
+def test_the_toy_synergies_fit_recordings_worse_than_nmf(conf, tmp_path, capsys):
+    code = compile(FILES["recordings.py"], "recordings.py", "exec")
+    sys.path.append(str(tmp_path))
+    exec(code, {"__name__": "__main__"})
+    nmf, at_random = (float(line.split()[-1]) for line in capsys.readouterr().out.splitlines())
+    assert nmf > 0.99 > at_random > 0
+
+
+def test_the_command_line_knows_kinds_that_have_a_file(conf):
+    check_overrides(conf / "config.yaml", [*OWN, "exploration.lr=0.1", "synergies.seed=3"], "")
+    assert translate(["synergies=random"], conf) == ["synergies=random"]
+    assert translate(["exploration.kind=a:B"], conf) == ["exploration.kind=a:B"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "words"),
+    [
+        ("curiosity:Curiositas", ValueError, "in curiosity there is no class Curiositas that is"),
+        ("curiosity:Surprise", ValueError, "no class Surprise that is derived from Exploration"),
+        ("no_such:Curiosity", ImportError, "There is no module 'no_such' for 'no_such:Curiosity'"),
+        ("curiosity", ValueError, r"exploration\.kind is 'curiosity'; choose one of metric, metra"),
+    ],
+)
+def test_a_kind_that_is_not_there_is_one_sentence(kind, error, words, conf):
+    config = tiny("run_dir=unused", *OWN, conf=conf)
+    config.exploration.kind = kind
+    with pytest.raises(error, match=words):
+        Explorer(Experiment(config).context)
+
+
+def test_a_kind_of_one_s_own_without_its_file_is_told_to_get_one(conf):
+    config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity", conf=conf)
+    with pytest.raises(ValueError, match=r"a file of its own in recipes/conf/exploration\.$"):
+        Explorer(Experiment(config).context)
+
+
+def test_fit_synergies_takes_a_class_of_one_s_own_by_its_name(conf):
+    model = fit_synergies(torch.rand(50, 6), "at_random:RandomSynergies", 2, seed=3)
+    assert (model.kind, model.seed) == ("random", 3)

@@ -1,0 +1,162 @@
+"""Stage 1 of ETL: explore, and condense the actions into synergies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_etl.checks import naming
+from torchrl_etl.exploration import EXPLORATIONS, Exploration
+from torchrl_etl.learners import Term
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.own_code import find_class
+from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
+from torchrl_etl.training.context import Context
+
+__all__ = ["Explorer", "make_exploration", "make_synergy_model"]
+
+T = TypeVar("T")
+_OTHER_OPTIONS = ("unexpected keyword argument", "required keyword-only argument")
+
+
+class Explorer:
+    """Stage 1: an exploration, a learner that is paid for it, and a synergy model beside it.
+
+    Every update draws one batch. Its bonus is computed as it is drawn, with the representation as
+    it then is; the policy, the representation and the synergy model learn from it side by side.
+
+    Deviates: after the last frame the synergy model is trained on for ``final_updates``; Algorithm
+    1 stops with the last frame (0).
+
+    Attributes:
+        exploration (Exploration): see there.
+        model (SynergyModel): see there.
+        stage (Stage): stage 1.
+    """
+
+    def __init__(self, context: Context) -> None:
+        fit = dict(context.options("explore")["fit"])
+        self.final_updates = fit.pop("final_updates")
+        context.seed_everything("explore")
+        self.exploration = make_exploration(context)
+        self.model = make_synergy_model(context)
+        self.relabel = self.exploration.relabel_transforms()
+        transforms = (*self.relabel, *self.exploration.batch_transforms())
+        for transform in transforms:
+            transform.to(context.device)
+
+        def more(actor):
+            with naming("fit"):
+                self.shown = ShownActions(actor, **fit)
+            terms = list(self.exploration.terms())
+            self.term = None
+            if self.model.loss is not None:
+                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)
+                terms.append(self.term)
+            return {"terms": terms, "reward": self.exploration.reward}
+
+        learner = context.learner(
+            "explore",
+            inputs=self.exploration.inputs,
+            wrap=self.exploration.behavior,
+            more=more,
+        )
+        env_options = {"activations": True} if fit["actions"] == "activation" else {}
+        self.stage = context.stage(
+            learner,
+            "explore",
+            env_options=env_options,
+            env_transforms=self.exploration.reset_transforms(),
+            transforms=transforms,
+            keep=(*self.exploration.keep, *self.shown.keep),
+        )
+        self.seed = self.stage.seed
+
+    def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
+        """Train the synergy model to the end; returns the decoder for stage 2.
+
+        Keyword Args:
+            on_update (callable): called before every update; may raise to stop.
+        """
+        torch.manual_seed(self.seed)  # the same whether or not the run was resumed
+        if self.term is None:
+            self.model.fit(self.actions(), on_update=on_update)
+        for _ in range(self.final_updates if self.term is not None else 0):
+            on_update()
+            self.stage.learner.update_term(self.term, self.stage.buffer.sample())
+        return self.model.decoder(self.actions())
+
+    def actions(self, count: int = 20_000) -> torch.Tensor:
+        """Up to ``count`` of the latest actions that the synergy model is shown [N, n].
+
+        Rows are relabelled, as in a batch.
+        """
+        rows = self.stage.newest(count).to(self.stage.device)
+        for transform in self.relabel:
+            rows = transform(rows)
+        return self.shown(rows)["action"]
+
+    def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
+        """All that was explored as stage 2 has it: the task's reward, and each executed action with
+        the coefficients that come nearest to it.
+        """
+        rows = self.stage.newest(self.stage.budget)
+        kept = rows.select("observation", "action", ("next", "observation"))
+        kept["next"].update(rows["next"].select("done", "terminated"))
+        kept["next", "reward"] = rows["next", "reward"] / self.stage.reward_scale
+        return kept.set("synergy", decoder.encode(rows["action"]))
+
+
+def make_exploration(context: Context) -> Exploration:
+    """The exploration that the configuration names."""
+    options = context.options("exploration")
+    return _make("exploration", EXPLORATIONS, Exploration, (context.spec,), **options)
+
+
+def make_synergy_model(
+    context: Context, num_synergies: int | None = None, **options: Any
+) -> SynergyModel:
+    """The synergy model that the configuration names.
+
+    Args:
+        context (Context): of the run.
+        num_synergies (int, optional): d. Default: the configured one.
+
+    Keyword Args:
+        **options: in place of configured ones.
+    """
+    options = {**context.options("synergies"), **options}
+    options.pop("bundle", None)
+    number = context.config.num_synergies if num_synergies is None else num_synergies
+    inputs = (context.spec.low, context.spec.high, number)
+    return _make("synergies", SYNERGY_MODELS, SynergyModel, inputs, **options)
+
+
+def _make(
+    section: str,
+    kinds: Mapping[str, type[T]],
+    base: type[T],
+    inputs: tuple[Any, ...],
+    *,
+    kind: str,
+    **options: Any,
+) -> T:
+    """One of ``kinds``, or of one's own, with the options of its section of the configuration."""
+    with naming(section):
+        found = find_class(kind, kinds, base)
+    try:
+        with naming(section):
+            return found(*inputs, **options)
+    except TypeError as error:
+        if not any(fault in str(error) for fault in _OTHER_OPTIONS):
+            raise
+        cure = f"choose {section}={kind}, which brings its own"
+        if kind not in kinds:
+            cure = f"give this kind a file of its own in recipes/conf/{section}"
+        raise ValueError(
+            f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
+            f"{cure}."
+        ) from error

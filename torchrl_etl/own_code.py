@@ -1,0 +1,83 @@
+"""A user's own code by its name, ``"module:name"``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Mapping
+from types import ModuleType
+from typing import TypeVar
+
+from torchrl_etl.checks import check_choice
+
+__all__ = ["find_class", "import_own"]
+
+T = TypeVar("T")
+
+
+def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T]:
+    """The class of a kind: one of ``kinds``, or of one's own where it is ``"module:Class"``.
+
+    Args:
+        kind (str): the name.
+        kinds (mapping): classes by name.
+        base (type): what a class of one's own must be derived from.
+
+    Raises:
+        ImportError: if there is no such module.
+        ValueError: if the name is unknown, or the module has no such class.
+
+    Examples:
+        >>> find_class("whole", {"whole": int, "real": float}, object)
+        <class 'int'>
+        >>> find_class("fractions:Fraction", {}, object)
+        <class 'fractions.Fraction'>
+        >>> find_class("fractions:Fraktion", {}, int)
+        Traceback (most recent call last):
+        ...
+        ValueError: kind is 'fractions:Fraktion', but in fractions there is no class Fraktion that
+        is derived from int.
+    """
+    if not isinstance(kind, str) or ":" not in kind:
+        check_choice("kind", kind, list(kinds))
+        return kinds[kind]
+    module, _, name = kind.rpartition(":")
+    own = import_own(module, f"{kind!r}; a kind of your own is 'module:Class'")
+    found = getattr(own, name, None)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ValueError(
+            f"kind is {kind!r}, but in {module} there is no class {name} that is derived from "
+            f"{base.__name__}."
+        )
+    return found
+
+
+def import_own(module: str, usage: str) -> ModuleType:
+    """Import a module that is installed or in the current folder.
+
+    The current folder is looked into last; a script in another folder would not see it.
+
+    Args:
+        module (str): its name.
+        usage (str): what it is for, and how to name it.
+
+    Raises:
+        ImportError: if there is no such module. What the module itself fails to import is for its
+            author to see as it is.
+    """
+    here = os.getcwd()
+    if here not in sys.path:
+        sys.path.append(here)
+    fault = ImportError(
+        f"There is no module {module!r} for {usage}, with the module installed or in the current "
+        "folder."
+    )
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise fault
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):  # it is there, but what it needs is not
+            raise
+        raise fault from error
