@@ -12,7 +12,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from benchmarks.body_synergies import body_decoder, muscle_changes
+from studies.body_synergies import body_decoder, muscle_changes
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis import joint_effects
 from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env
@@ -61,7 +61,7 @@ def test_the_decoder_rests_where_it_is_told_and_moves_joints():
 
 
 def script(name, *arguments):
-    command = [sys.executable, str(ROOT / "benchmarks" / name), *map(str, arguments)]
+    command = [sys.executable, str(ROOT / "studies" / name), *map(str, arguments)]
     environ = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(command, check=True, timeout=240, capture_output=True, env=environ)
 

@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
-from benchmarks.many_runs.group import EXPLORED, Group
-from benchmarks.many_runs.learner import Learner
-from benchmarks.many_runs.returns import ReturnScales
-from benchmarks.many_runs.settings import Settings, Shape
+from studies.many_runs.group import EXPLORED, Group
+from studies.many_runs.learner import Learner
+from studies.many_runs.returns import ReturnScales
+from studies.many_runs.settings import Settings, Shape
 from tests.configs import RESIDUAL, ROOT, tiny
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import entropy_target
@@ -202,7 +202,7 @@ def test_a_run_begins_where_the_recipe_begins_and_ends_in_a_table(tmp_path):
     described = {"frames": 6, "groups": [{"shape": shape, "runs": [run]} for run in runs]}
     runs[1]["charged"] = 1
     (tmp_path / "runs.json").write_text(json.dumps(described))
-    command = [sys.executable, "-m", "benchmarks.many_runs", str(tmp_path / "runs.json")]
+    command = [sys.executable, "-m", "studies.many_runs", str(tmp_path / "runs.json")]
     out = tmp_path / "results.csv"
     command += ["--out", str(out), "--every", "4", "--workers", "2", "--commit", "abc"]
     subprocess.run(command, check=True, cwd=ROOT, timeout=120)

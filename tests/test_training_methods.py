@@ -47,7 +47,7 @@ def config(method: str, run: Path, *overrides: str):
 def test_a_file_names_itself_and_makes_stages(method, tmp_path):
     made = tiny(f"method={method}", "run_dir=unused", ELBOW)
     assert made.method.name == method
-    if made.synergies.bundle is not None:  # such as one of benchmarks/body_synergies.py
+    if made.synergies.bundle is not None:  # such as one of studies/body_synergies.py
         spec = EnvironmentSpec.of(make_env(made.env))
         bounds = {"low": spec.low.tolist(), "high": spec.high.tolist()}
         decoder = SynergyDecoder(2, spec.action_dim, hidden=(8,), **bounds)

@@ -1,6 +1,6 @@
 """Synergies of a policy that has learned a task: what explored ones could be at best.
 
-    python benchmarks/learned_synergies.py runs/SAC_RUN learned/hand_pose --num-synergies 8
+    python studies/learned_synergies.py runs/SAC_RUN learned/hand_pose --num-synergies 8
 
 Takes the averaged actor of a run of plain SAC, lets it act with its noise, and fits a GMVAE, or
 principal components before the bounds (``--model pca``), on the mean actions in the states that it

@@ -1,6 +1,6 @@
 """How much of what synergies command turns joints; no learning, one CSV row a bundle.
 
-    python benchmarks/joint_effects.py runs/EXPLORED runs/OTHER --out docs/results/joint_effects.csv
+    python studies/joint_effects.py runs/EXPLORED runs/OTHER --out docs/results/joint_effects.csv
 
 RUN is a run folder of ETL. Its bundle is asked for uniform coefficients, and the excitations that
 they decode to are laid beside the moment arms of its task: ``share``, ``chance`` and ``gain`` are
@@ -8,7 +8,7 @@ those of :func:`~torchrl_etl.analysis.joint_effects`. ``shuffled`` is the mean s
 ``shuffled_sd`` its standard deviation, when muscles change places at random: what a share must
 leave to say anything. The first run of a task brings three rows to compare with: uniform actions,
 as many random directions around the middle action, and the body's own synergies
-(``benchmarks/body_synergies.py``). Rows are appended.
+(``studies/body_synergies.py``). Rows are appended.
 """
 
 from __future__ import annotations

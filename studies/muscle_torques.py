@@ -1,6 +1,6 @@
 """What each muscle can do to each joint of a MyoSuite task, in newton metres.
 
-    python benchmarks/muscle_torques.py myoHandPose --joints mcp3 pm3 md3 --out torques.csv
+    python studies/muscle_torques.py myoHandPose --joints mcp3 pm3 md3 --out torques.csv
 
 The torque on a joint of one muscle at full activation, all others off, at rest in the goal posture
 of a pose task, or in the initial posture of another.

@@ -1,6 +1,6 @@
 """How good the synergies of stage 1 are, by default and read literally; one CSV row a run.
 
-    python benchmarks/synergies.py --env myoHandPose --seeds 0 1
+    python studies/synergies.py --env myoHandPose --seeds 0 1
 
 Finished rows are kept: run it again and it goes on with what is missing.
 """

@@ -1,6 +1,6 @@
 """How a trained policy moves muscles, and how far more updates still move it.
 
-    python benchmarks/policy_drift.py RUN [RUN ...] --out docs/results/policy_drift.csv
+    python studies/policy_drift.py RUN [RUN ...] --out docs/results/policy_drift.csv
 
 RUN is a run folder with a checkpoint of stage 2, ETL's or a rival's. On a thousand of the newest
 observations, where a muscle's bounds are ±1: ``mean_size`` is the root mean square of the muscles

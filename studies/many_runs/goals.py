@@ -1,7 +1,7 @@
 """A file of runs for the goals: SAC and ETL on six tasks of MyoSuite's hand.
 
-    python -m benchmarks.many_runs.goals goals --seeds 0 1 2 --jobs 2
-    python -m benchmarks.many_runs goals/runs.json --out goals/results.csv --device cuda --workers 9
+    python -m studies.many_runs.goals goals --seeds 0 1 2 --jobs 2
+    python -m studies.many_runs goals/runs.json --out goals/results.csv --device cuda --workers 9
 
 The first explores, with the recipe, what ETL's runs start from, and takes some minutes of one core
 for each; bundles that are there already are not made again.

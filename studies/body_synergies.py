@@ -1,6 +1,6 @@
 """Synergies that follow from a body alone: each is the torque of one joint, or of several together.
 
-    python benchmarks/body_synergies.py myoLegWalk runs/body/myoLegWalk
+    python studies/body_synergies.py myoLegWalk runs/body/myoLegWalk
 
 The bundle that this leaves starts stage 2 as any other (``synergies=runs/body/myoLegWalk``). Its
 decoder is affine before the bounds (:meth:`SynergyDecoder.from_directions`), so nothing is fitted.

@@ -1,6 +1,6 @@
 """Synergies whose muscles have changed places: what is left of explored ones without their sense.
 
-    python benchmarks/shuffled_synergies.py runs/EXPLORED shuffled/hand_pose
+    python studies/shuffled_synergies.py runs/EXPLORED shuffled/hand_pose
 
 The bundle that this leaves spans as much, bends as much and varies as much as that of the run, but
 moves other muscles together. If stage 2 is as good with it, then not because of which ones. Beside

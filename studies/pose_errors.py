@@ -1,6 +1,6 @@
 """Where a trained policy's posture is wrong on Hand Pose: one row per joint and time.
 
-    python benchmarks/pose_errors.py RUN --out docs/results/pose_errors.csv
+    python studies/pose_errors.py RUN --out docs/results/pose_errors.csv
 
 RUN is a run folder with a checkpoint of stage 2. The policy is deterministic, the episode the first
 of the evaluation. An error is the joint's angle minus its target, in radians.

@@ -3,7 +3,7 @@
 One process steps a simulator of each run and updates all of their networks side by side. A file
 says which runs; their evaluations go to a table with the columns of the bench's.
 
-    python -m benchmarks.many_runs runs.json --out results.csv --device cuda --workers 14
+    python -m studies.many_runs runs.json --out results.csv --device cuda --workers 14
 
     {"frames": 100000, "groups": [
       {"shape": {"updates": 2}, "runs": [

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles.
 #
-#     sh benchmarks/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
+#     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
 #
 # One process after another, a thread each, two seeds; rows go to docs/results/kill_test. Kill it at
 # any time and start it again, here or on another machine: finished runs stay (the table alone is
@@ -29,12 +29,12 @@ queue() {
 queue sac
 queue etl
 [ -d "runs/oracles/body-$task" ] ||
-  $python benchmarks/body_synergies.py "$task" "runs/oracles/body-$task"
+  $python studies/body_synergies.py "$task" "runs/oracles/body-$task"
 queue etl_body
 learned=$out/$task-sac-seed0
 for model in gmvae pca; do
   oracle=runs/oracles/learned_$model-$task
   [ -d "$oracle" ] ||
-    $python benchmarks/learned_synergies.py "$learned" "$oracle" --model $model
+    $python studies/learned_synergies.py "$learned" "$oracle" --model $model
   queue etl_learned_$model
 done
