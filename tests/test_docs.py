@@ -12,9 +12,14 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
-# Builds all thirteen tasks and is compared with the page, where the environments are tested; files
-# of which one imports the other.
-TESTED_ELSEWHERE = {"docs/tasks.md": "tests/test_envs.py", "docs/extend.md": "tests/test_extend.py"}
+TESTED_ELSEWHERE = {
+    # Builds all thirteen tasks and is compared with the page.
+    "docs/tasks.md": "tests/test_envs.py",
+    # Files of which one imports the other.
+    "docs/extend.md": "tests/test_extend.py",
+    # Half of it runs in the environment of the peers.
+    "docs/without_torchrl.md": "tests/test_without_torchrl.py",
+}
 
 
 def name_of(page: Path) -> str:

@@ -8,6 +8,7 @@ from torchrl_etl.envs.factory import actuator_names, make_env
 from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
 from torchrl_etl.envs.simulator import mujoco_state
 from torchrl_etl.envs.spec import EnvironmentSpec
+from torchrl_etl.envs.synergy_action_wrapper import SynergyActionWrapper
 from torchrl_etl.envs.tasks import Task, episode_length, list_tasks, resolve_task
 from torchrl_etl.envs.wrappers import SimulationError
 
@@ -16,6 +17,7 @@ __all__ = [
     "EnvironmentSpec",
     "JointTorques",
     "SimulationError",
+    "SynergyActionWrapper",
     "Task",
     "actuator_names",
     "body_joints",

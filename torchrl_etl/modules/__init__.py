@@ -3,6 +3,7 @@
 from torchrl_etl.modules.actor_critic import make_actor, make_critic
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder, Posterior
 from torchrl_etl.modules.held_noise import HeldNoise
+from torchrl_etl.modules.policy_function import policy_function
 from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
@@ -25,4 +26,5 @@ __all__ = [
     "make_actor",
     "make_critic",
     "normalize_rows",
+    "policy_function",
 ]

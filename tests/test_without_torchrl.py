@@ -1,0 +1,129 @@
+"""Bundles and policies for code that knows Gymnasium and NumPy only."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.envs import TransformedEnv
+
+from tests.configs import ROOT
+from tests.test_docs import BLOCK
+from torchrl_etl.envs import SynergyActionWrapper, actuator_names, make_env
+from torchrl_etl.modules import SynergyDecoder, make_actor, policy_function
+from torchrl_etl.modules.bundle import BundleError, save_bundle
+from torchrl_etl.transforms import SynergyAction
+
+TASK = "torchrl_etl/Overactuated-v0"
+PAGE = ROOT / "docs" / "without_torchrl.md"
+PEERS = ROOT / ".venv-peers" / "bin" / "python"
+
+
+def decoder(residual: float = 0.0) -> SynergyDecoder:
+    torch.manual_seed(0)
+    return SynergyDecoder(3, 16, residual=residual)
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    names = actuator_names("overactuated")
+    return save_bundle(decoder(0.5), tmp_path / "synergies", task="toy", actuators=names)
+
+
+@pytest.mark.parametrize("residual", [0.0, 0.5])
+def test_the_wrapper_does_what_the_transform_does(residual):
+    wrapped = SynergyActionWrapper(gymnasium.make(TASK), decoder(residual))
+    transformed = TransformedEnv(make_env("overactuated"), SynergyAction(decoder(residual)))
+    transformed.set_seed(3)
+    state = transformed.reset()
+    wrapped.reset(seed=3)
+    observation, _ = wrapped.reset()  # TorchRL resets to seed, and then anew
+    np.testing.assert_array_equal(observation, state["observation"])
+    for _ in range(5):
+        synergy = transformed.full_action_spec["synergy"].rand()
+        assert wrapped.action_space.contains(synergy.numpy())
+        state = transformed.step(state.set("synergy", synergy))["next"]
+        observation, reward, *_ = wrapped.step(synergy.numpy())
+        np.testing.assert_array_equal(observation, state["observation"])
+        assert reward == pytest.approx(state["reward"].item())
+
+
+def test_gymnasium_s_checker_finds_no_fault(bundle):
+    env = SynergyActionWrapper(gymnasium.make(TASK), bundle)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*different from the unwrapped version.*")
+        warnings.filterwarnings("ignore", ".*bounds.*infinity.*|.*Box observation space.*")
+        check_env(env)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (3 + 16,))
+    again = env.spec.make()
+    assert isinstance(again, SynergyActionWrapper) and again.action_space == env.action_space
+
+
+def test_a_residual_of_a_bundle_can_be_left_out(bundle):
+    env = SynergyActionWrapper(gymnasium.make(TASK), bundle, residual=0.0)
+    assert env.action_space.shape == (3,)
+
+
+def test_the_muscles_of_a_bundle_must_be_the_environment_s(tmp_path):
+    names = [f"other_{i}" for i in range(16)]
+    bundle = save_bundle(decoder(), tmp_path / "synergies", task="toy", actuators=names)
+    env = gymnasium.make(TASK)
+    with pytest.raises(BundleError, match="no name in common"):
+        SynergyActionWrapper(env, bundle)
+    with pytest.raises(BundleError, match="There is no synergy bundle"):
+        SynergyActionWrapper(env, tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (SynergyDecoder(3, 15), "writes 15 actuators but the environment has 16"),
+        (SynergyDecoder(3, 16, low=0.0), r"acts in \[0, 1\] but the environment in \[-1, 1\]"),
+    ],
+)
+def test_a_decoder_of_another_body_is_one_sentence(given, words):
+    with pytest.raises(ValueError, match=words):
+        SynergyActionWrapper(gymnasium.make(TASK), given)
+
+
+def test_actions_that_are_no_flat_box_are_one_sentence():
+    with pytest.raises(ValueError, match="continuous actuators"):
+        SynergyActionWrapper(gymnasium.make("CartPole-v1"), decoder())
+
+
+def test_a_policy_function_is_the_policy_without_noise():
+    torch.manual_seed(0)
+    actor = make_actor({"observation": 6}, Bounded(-1, 1, shape=(16,)))
+    act, seen = policy_function(actor), np.random.default_rng(0).random((4, 6))
+    written = actor[0](TensorDict({"observation": torch.tensor(seen).float()}, [4]))
+    np.testing.assert_allclose(act(seen), written["loc"].detach().tanh(), atol=1e-6)
+    np.testing.assert_array_equal(act(seen), act(seen.tolist()))
+    np.testing.assert_allclose(act(seen[0]), act(seen)[0], atol=1e-6)
+    with pytest.raises(ValueError, match="write 'synergy', else name other keys"):
+        policy_function(actor, action_key="synergy")
+
+
+def test_the_page_runs_with_stable_baselines3_among_the_peers(tmp_path):
+    if not PEERS.exists():
+        pytest.skip("Stable-Baselines3 is not installed; make .venv-peers/.complete installs it.")
+    blocks = [block[1] for block in BLOCK.finditer(PAGE.read_text(encoding="utf-8"))]
+    assert len(blocks) == 2 and "stable_baselines3" in blocks[1]
+    environ = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [str(PEERS), "-c", "\n".join(blocks)]
+    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_gymnasium_part_of_the_page_runs_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    block = next(BLOCK.finditer(PAGE.read_text(encoding="utf-8")))
+    exec(compile(block[1], str(PAGE), "exec"), {"__name__": "__main__"})

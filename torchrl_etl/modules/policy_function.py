@@ -1,0 +1,62 @@
+"""A policy as whoever knows neither TensorDict nor TorchRL calls it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import ExplorationType, set_exploration_type
+
+__all__ = ["policy_function"]
+
+
+def policy_function(
+    policy: TensorDictModuleBase,
+    *,
+    observation_key: NestedKey = "observation",
+    action_key: NestedKey = "action",
+) -> Callable[[ArrayLike], np.ndarray]:
+    """A deterministic function of an observation: NumPy in, NumPy out.
+
+    The policy is held by reference: it may go on learning.
+
+    Args:
+        policy (TensorDictModuleBase): reads one key, and writes the action among others.
+
+    Keyword Args:
+        observation_key, action_key (NestedKey): what it reads, and what is wanted of it: with
+            ``"synergy"`` the coefficients of a policy that acts through a decoder.
+
+    Returns:
+        callable: from an observation [*, O] to an action [*, n] in single precision.
+
+    Raises:
+        ValueError: if the policy does not read that key alone, or does not write the other.
+
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_etl.modules import make_actor
+        >>> act = policy_function(make_actor({"observation": 3}, Bounded(-1, 1, shape=(2,))))
+        >>> act(np.zeros(3)).shape, act(np.zeros((5, 3))).shape
+        ((2,), (5, 2))
+    """
+    if list(policy.in_keys) != [observation_key] or action_key not in policy.out_keys:
+        raise ValueError(
+            f"The policy reads {list(policy.in_keys)} and writes {list(policy.out_keys)}; it must "
+            f"read {observation_key!r} alone and write {action_key!r}, else name other keys."
+        )
+    device = next((tensor.device for tensor in policy.parameters()), None)
+
+    @torch.no_grad()
+    def act(observation: ArrayLike) -> np.ndarray:
+        seen = torch.as_tensor(np.asarray(observation), dtype=torch.float32, device=device)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            written = policy(TensorDict({observation_key: seen}, seen.shape[:-1]))
+        return written[action_key].cpu().numpy()
+
+    return act
