@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pytest import MonkeyPatch
 
-from tests.configs import CONF, tiny
+from tests.configs import tiny
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training.run_folder import RunFolder
 
@@ -29,7 +29,7 @@ def numbers(run: Path) -> dict[str, str]:
     return {**scalars, "summary": json.dumps(summary)}
 
 
-def killed_when_saved(run: Path, frames: int, *overrides: str, conf: Path = CONF) -> None:
+def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
     """A tiny run that ends, as if killed, when its checkpoint of so many frames is finished."""
 
     def remember_and_die(self, stage, saved):
@@ -41,4 +41,4 @@ def killed_when_saved(run: Path, frames: int, *overrides: str, conf: Path = CONF
     with MonkeyPatch.context() as patch:
         patch.setattr(RunFolder, "remember_saved", remember_and_die)
         with pytest.raises(ZeroDivisionError):
-            Experiment(tiny(f"run_dir='{run}'", *overrides, conf=conf)).run()
+            Experiment(tiny(f"run_dir='{run}'", *overrides)).run()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import torch
 from torch import nn
 
@@ -9,6 +12,7 @@ from tests.configs import tiny
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.training.stage import Stage
 
 
 def explorer(*overrides):
@@ -45,3 +49,20 @@ def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
 
 def changed(module: nn.Module, before: dict[str, torch.Tensor]) -> bool:
     return any(not torch.equal(value, before[key]) for key, value in module.state_dict().items())
+
+
+def goes_on_after_a_load(make: Callable[[], Stage], folder: Path) -> bool:
+    """Whether a stage that was saved and its twin, loaded, then collect and learn the same."""
+    stage, twin = make(), make()
+    stage.restart_collection()
+    for _ in range(5):
+        stage.collect(), stage.learn()
+    stage.checkpoint().save(folder / "saved")
+    rows = []
+    for one in (stage, twin):
+        one.checkpoint().load(folder / "saved")
+        one.restart_collection()
+        rows.append([one.collect().select("action", "observation") for _ in range(3)])
+        rows[-1].append(one.update())
+        one.close()
+    return all((ours == theirs).all() for ours, theirs in zip(*rows, strict=True))

@@ -6,6 +6,7 @@ from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.exploration.metra import METRAExploration
 from torchrl_etl.exploration.metric import MetricExploration
+from torchrl_etl.exploration.rnd import RNDExploration
 
 __all__ = [
     "EXPLORATIONS",
@@ -13,10 +14,12 @@ __all__ = [
     "Exploration",
     "METRAExploration",
     "MetricExploration",
+    "RNDExploration",
 ]
 
 EXPLORATIONS: Mapping[str, type[Exploration]] = {
     "metric": MetricExploration,
     "metra": METRAExploration,
+    "rnd": RNDExploration,
 }
 """Kinds of exploration by name; ``"my_module:MyExploration"`` names one's own."""

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_real
+from torchrl_etl.checks import check_real, naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.modules import StateEncoder
@@ -53,11 +53,14 @@ class DirectionExploration(Exploration):
     ) -> None:
         super().__init__(spec)
         check_real("[0, 1]", relabel=relabel)
-        self.encoder = StateEncoder(spec.observation_dim, **encoder).to(spec.device)
+        with naming("encoder"):
+            self.encoder = StateEncoder(spec.observation_dim, **encoder).to(spec.device)
         self.inputs = {"direction": self.encoder.embedding_dim}
-        self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)
+        with naming("direction"):
+            self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)
         self._redraw = RedrawDirection(self.primer.clone(), share=relabel)
-        self._bonus = IntrinsicReward(self.encoder, **bonus)
+        with naming("bonus"):
+            self._bonus = IntrinsicReward(self.encoder, **bonus)
 
     def reset_transforms(self) -> Sequence[Transform]:
         return (self.primer,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torchrl_etl.checks import check_real
+from torchrl_etl.checks import check_real, naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
@@ -37,4 +37,6 @@ class METRAExploration(DirectionExploration):
 
     def terms(self) -> Sequence[Term]:
         device = next(self.encoder.parameters()).device
-        return (Term(METRALoss(self.encoder, **self._metra).to(device), lr=self._lr),)
+        with naming("metra"):
+            loss = METRALoss(self.encoder, **self._metra).to(device)
+        return (Term(loss, lr=self._lr),)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_etl.checks import check_flag, check_real
+from torchrl_etl.checks import check_flag, check_real, naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
@@ -50,6 +50,7 @@ class MetricExploration(DirectionExploration):
         if self._metric.get("divergence") == "gaussian":
             dynamics = GaussianDynamics(self.encoder.embedding_dim)
         device = next(self.encoder.parameters()).device
-        loss = BehavioralMetricLoss(self.encoder, dynamics, **self._metric).to(device)
+        with naming("metric"):
+            loss = BehavioralMetricLoss(self.encoder, dynamics, **self._metric).to(device)
         tau = self._tau if self._metric.get("delay_encoder", True) else None
         return (Term(loss, lr=self._lr, tau=tau),)

@@ -48,10 +48,12 @@ class Explorer:
         for transform in transforms:
             transform.to(context.device)
 
+        with naming("exploration"):
+            terms = list(self.exploration.terms())
+
         def more(actor):
             with naming("fit"):
                 self.shown = ShownActions(actor, **fit)
-            terms = list(self.exploration.terms())
             self.term = None
             if self.model.loss is not None:
                 self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)

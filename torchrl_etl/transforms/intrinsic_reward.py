@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_etl.functional import direction_bonus
-from torchrl_etl.modules.running_deviation import RunningDeviation
-from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
+from torchrl_etl.transforms.scaled_bonus import ScaledBonus
+from torchrl_etl.transforms.transition_reward import evaluate
 
 __all__ = ["IntrinsicReward"]
 
 
-class IntrinsicReward(TransitionReward):
+class IntrinsicReward(ScaledBonus):
     """Rewards movement of the state embedding along the direction of the episode.
 
     The same class works in three places:
@@ -56,16 +57,8 @@ class IntrinsicReward(TransitionReward):
         in_keys (sequence of NestedKey): keys of observation and direction. Default:
             ``("observation", "direction")``.
         out_key (NestedKey): Default: ``"intrinsic_reward"``.
-        normalize (bool): divide bonus and task reward by their running standard deviations.
-            Default: ``True``.
-        decay (float): in (0, 1); a call (one env step or one sampled batch) weighs ``1 - decay`` in
-            the running statistics. Default: 0.99.
-        extrinsic_weight (float): weight of the task's reward. Default: 0.
-        reward_key (NestedKey): the task's reward, read where ``extrinsic_weight`` is not 0.
-            Default: ``"reward"``.
-        update_statistics (bool): whether calls update the running statistics; an attribute of the
-            same name can be set at any time. It does not depend on train and eval mode, since
-            TorchRL puts transforms of envs and buffers in eval mode. Default: ``True``.
+        **scale: ``normalize``, ``decay``, ``extrinsic_weight``, ``reward_key`` and
+            ``update_statistics``, see :class:`~torchrl_etl.transforms.ScaledBonus`.
 
     Keys:
         reads ``observation`` [*, O], ``direction`` [*, k], ``("next", "observation")`` and, with an
@@ -115,11 +108,7 @@ class IntrinsicReward(TransitionReward):
         *,
         in_keys: Sequence[NestedKey] = ("observation", "direction"),
         out_key: NestedKey = "intrinsic_reward",
-        normalize: bool = True,
-        decay: float = 0.99,
-        extrinsic_weight: float = 0.0,
-        reward_key: NestedKey = "reward",
-        update_statistics: bool = True,
+        **scale: Any,
     ) -> None:
         if not (hasattr(encoder, "in_keys") and hasattr(encoder, "out_keys")):
             raise TypeError(
@@ -135,17 +124,10 @@ class IntrinsicReward(TransitionReward):
             raise ValueError(
                 f"in_keys is {in_keys!r}; pass a pair of keys, the observation and the direction."
             )
-        if not 0.0 < decay < 1.0:
-            raise ValueError(f"decay is {decay}; it must lie strictly between 0 and 1.")
-        super().__init__(in_keys=list(in_keys), out_keys=[out_key])
+        super().__init__(in_keys, out_key, **scale)
         # Outside the module list: as a submodule the encoder would follow the env's device, be put
         # in eval mode under the learner's feet, and be saved twice.
         self.__dict__["_encoder"] = encoder
-        self.deviation = RunningDeviation(decay) if normalize else None
-        self.reward_deviation = RunningDeviation(decay) if normalize and extrinsic_weight else None
-        self.extrinsic_weight = extrinsic_weight
-        self.reward_key = unravel_key(reward_key)
-        self.update_statistics = update_statistics
 
     @property
     def encoder(self) -> TensorDictModuleBase:
@@ -160,14 +142,9 @@ class IntrinsicReward(TransitionReward):
     def _typed_by(self) -> NestedKey:
         return self.in_keys[1]
 
-    @torch.no_grad()
-    def _rewards(
-        self,
-        observation: Tensor,
-        next_observation: Tensor,
-        tensordict: TensorDictBase,
-        next_tensordict: TensorDictBase,
-    ) -> tuple[Tensor]:
+    def _bonus(
+        self, observation: Tensor, next_observation: Tensor, tensordict: TensorDictBase
+    ) -> Tensor:
         direction_key = self.in_keys[1]
         direction = self._read(tensordict, direction_key)
         # One pass through the encoder for both ends of the transition.
@@ -181,18 +158,4 @@ class IntrinsicReward(TransitionReward):
             )
         while direction.ndim < embedding.ndim:  # one direction for a group of agents
             direction = direction.unsqueeze(-2)
-        bonus = direction_bonus(embedding, next_embedding, direction.expand_as(embedding))
-        bonus = self._scaled(bonus, self.deviation)
-        if self.extrinsic_weight:
-            reward = self._read(next_tensordict, self.reward_key, "next").to(bonus)
-            bonus = bonus + self.extrinsic_weight * self._scaled(reward, self.reward_deviation)
-        return (bonus,)
-
-    def _scaled(self, values: Tensor, deviation: RunningDeviation | None) -> Tensor:
-        if deviation is None:
-            return values
-        if deviation.mean.device != values.device:
-            deviation.to(values.device)
-        if self.update_statistics:
-            deviation.update(values)
-        return values / deviation.divisor
+        return direction_bonus(embedding, next_embedding, direction.expand_as(embedding))

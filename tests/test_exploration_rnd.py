@@ -1,0 +1,84 @@
+"""Stage 1 with RND: what is learned by whom, that the bonus fades, that a killed run goes on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.stages import changed, explorer, fill, goes_on_after_a_load, snapshot
+from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.exploration import RNDExploration
+
+SMALL = ("exploration=rnd", "exploration.hidden=[16]", "exploration.features=8")
+
+
+@pytest.fixture(scope="module")
+def found():
+    found = explorer(*SMALL)
+    fill(found.stage)
+    yield found
+    found.stage.close()
+
+
+def test_the_policy_is_paid_with_the_bonus_and_reads_the_observation_alone(found):
+    assert found.exploration.reward == "intrinsic_reward"
+    assert found.stage.learner.objective.sac.tensor_keys.reward == "intrinsic_reward"
+    batch = found.stage.buffer.sample()
+    assert "direction" not in batch.keys() and batch["next", "intrinsic_reward"].shape == (32, 1)
+    assert found.exploration.embed(batch) is None
+
+
+def test_one_update_moves_policy_predictor_and_gmvae_but_not_the_random_network(found):
+    loss, stage = found.exploration.loss, found.stage
+    moving = (stage.learner.behavior, loss.predictor_network, found.model.model)
+    before = [snapshot(part) for part in moving]
+    fixed = snapshot(loss.target_network)
+    stage.update()
+    assert all(changed(part, was) for part, was in zip(moving, before, strict=True))
+    assert not changed(loss.target_network, fixed)
+
+
+def test_only_the_terms_loss_reaches_the_predictor(found):
+    loss, objective = found.exploration.loss, found.stage.learner.objective
+    batch = found.stage.buffer.sample()
+    parameters = list(loss.predictor_network.parameters())
+    own = torch.autograd.grad(loss(batch)["loss_predictor"], parameters)
+    assert all(gradient.abs().sum() > 0 for gradient in own)
+    sac = objective.sac(objective.prepare(batch))
+    total = sac["loss_actor"] + sac["loss_qvalue"]
+    assert torch.autograd.grad(total, parameters, allow_unused=True) == (None,) * len(parameters)
+
+
+def test_the_bonus_of_what_the_predictor_learned_fades():
+    torch.manual_seed(0)
+    spec = EnvironmentSpec.of(make_env("overactuated"))
+    scale = {"normalize": False}
+    rnd = RNDExploration(spec, features=8, hidden=[16], lr=1e-2, update_fraction=1.0, bonus=scale)
+    (bonus,), (term,) = rnd.batch_transforms(), rnd.terms()
+    rows = make_env("overactuated").rollout(50, break_when_any_done=False)
+    first = bonus(rows)["next", "intrinsic_reward"].mean()
+    optimizer = torch.optim.Adam(rnd.loss.predictor_network.parameters(), lr=term.lr)
+    for _ in range(100):
+        optimizer.zero_grad()
+        term(rows)[0].backward()
+        optimizer.step()
+    assert bonus(rows)["next", "intrinsic_reward"].mean() < 0.2 * first
+
+
+def test_a_resumed_stage_goes_on_with_the_same_numbers(tmp_path):
+    assert goes_on_after_a_load(lambda: explorer(*SMALL).stage, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("features=0", "exploration.features is 0"),
+        ("hidden=[]", "exploration.hidden is"),
+        ("lr=0", "exploration.lr is 0"),
+        ("update_fraction=0", "exploration.update_fraction is 0"),
+        ("bonus.decay=1", "exploration.bonus.decay is 1"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_by_name(setting, words):
+    with pytest.raises(ValueError, match=words):
+        explorer("exploration=rnd", f"exploration.{setting}")

@@ -1,0 +1,72 @@
+"""Exploration by random network distillation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import nn
+from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms.rnd import RunningMeanStd
+from torchrl.modules import MLP
+from torchrl.objectives import RNDLoss
+
+from torchrl_etl.checks import check_positive, check_real, check_sizes, naming
+from torchrl_etl.envs import EnvironmentSpec
+from torchrl_etl.exploration.exploration import Exploration
+from torchrl_etl.learners.term import Term
+from torchrl_etl.transforms import RNDBonus
+
+__all__ = ["RNDExploration"]
+
+
+class RNDExploration(Exploration):
+    """What was seldom seen is rewarded: its random features are predicted badly (Burda 2018).
+
+    The loss is TorchRL's. Nothing is drawn at reset, and the policy reads the observation alone.
+
+    Equation: see :class:`~torchrl_etl.transforms.RNDBonus`.
+
+    Args:
+        spec (EnvironmentSpec): sizes, bounds and device of the environment.
+
+    Keyword Args:
+        features (int): outputs of the random network.
+        hidden (sequence of int): widths of its layers and of the predictor's.
+        lr (float): learning rate of the predictor.
+        update_fraction (float): share of each batch that the predictor learns from.
+        bonus (mapping): keyword arguments of :class:`~torchrl_etl.transforms.ScaledBonus`.
+    """
+
+    reward = "intrinsic_reward"
+
+    def __init__(
+        self,
+        spec: EnvironmentSpec,
+        *,
+        features: int,
+        hidden: Sequence[int],
+        lr: float,
+        update_fraction: float,
+        bonus: Mapping[str, Any],
+    ) -> None:
+        super().__init__(spec)
+        check_positive(features=features)
+        check_sizes(hidden=hidden)
+        check_real("(0, inf)", lr=lr)
+        check_real("(0, 1]", update_fraction=update_fraction)
+        target, predictor = (
+            MLP(spec.observation_dim, features, num_cells=hidden, activation_class=nn.ReLU)
+            for _ in range(2)
+        )
+        statistics = RunningMeanStd((spec.observation_dim,))
+        loss = RNDLoss(predictor, target, obs_rms=statistics, update_fraction=update_fraction)
+        self.loss, self._lr = loss.to(spec.device), lr
+        with naming("bonus"):
+            self._bonus = RNDBonus(self.loss, **bonus)
+
+    def batch_transforms(self) -> Sequence[Transform]:
+        return (self._bonus,)
+
+    def terms(self) -> Sequence[Term]:
+        return (Term(self.loss, lr=self._lr),)
