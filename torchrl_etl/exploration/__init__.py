@@ -6,14 +6,17 @@ from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.exploration.metra import METRAExploration
 from torchrl_etl.exploration.metric import MetricExploration
+from torchrl_etl.exploration.noise import LastingNoise, NoiseExploration
 from torchrl_etl.exploration.rnd import RNDExploration
 
 __all__ = [
     "EXPLORATIONS",
     "DirectionExploration",
     "Exploration",
+    "LastingNoise",
     "METRAExploration",
     "MetricExploration",
+    "NoiseExploration",
     "RNDExploration",
 ]
 
@@ -21,5 +24,6 @@ EXPLORATIONS: Mapping[str, type[Exploration]] = {
     "metric": MetricExploration,
     "metra": METRAExploration,
     "rnd": RNDExploration,
+    "noise": NoiseExploration,
 }
 """Kinds of exploration by name; ``"my_module:MyExploration"`` names one's own."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -29,11 +30,13 @@ class Exploration:
         reward (NestedKey): what SAC learns on in stage 1, below ``"next"``.
         keep (sequence of NestedKey): entries of a transition that the buffer must keep for it.
         inputs (mapping): sizes of what actor and critics read beside the observation, by key.
+        learns (bool): whether a policy does; if not, updates train the synergy model alone.
     """
 
     reward: NestedKey = "reward"
     keep: Sequence[NestedKey] = ()
     inputs: Mapping[str, int]
+    learns: ClassVar[bool] = True
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self.inputs = {}

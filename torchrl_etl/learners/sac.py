@@ -184,12 +184,14 @@ class SACLearner:
         loss, scalars = self.objective(batch)
         return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
 
-    def update_term(self, term: Term, batch: TensorDictBase) -> None:
-        """One gradient step on a single term, by the same optimizer."""
-        gradients = torch.autograd.grad(term(batch)[0], self.parameters, allow_unused=True)
+    def update_term(self, term: Term, batch: TensorDictBase) -> TensorDictBase:
+        """One gradient step on a single term, by the same optimizer; returns scalars to log."""
+        loss, scalars = term(batch)
+        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         self.optimizer.step()
+        return scalars.detach()
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take a batch [simulators, time] as it was collected into the running statistics."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -10,7 +12,7 @@ from tensordict import TensorDictBase
 
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
-from torchrl_etl.learners import Term
+from torchrl_etl.learners import SACLearner, Term
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
@@ -42,6 +44,12 @@ class Explorer:
         self.final_updates = fit.pop("final_updates")
         context.seed_everything("explore")
         self.exploration = make_exploration(context)
+        if not self.exploration.learns and fit["actions"] in ("policy", "mean"):
+            raise ValueError(
+                f"explore.fit.actions is {fit['actions']!r}, but with exploration="
+                f"{context.config.exploration.kind} no policy learns whose actions could be shown; "
+                "use sampled or activation."
+            )
         self.model = make_synergy_model(context)
         self.relabel = self.exploration.relabel_transforms()
         transforms = (*self.relabel, *self.exploration.batch_transforms())
@@ -73,9 +81,18 @@ class Explorer:
             env_options=env_options,
             env_transforms=self.exploration.reset_transforms(),
             transforms=transforms,
+            **self._updates(learner),
             keep=(*self.exploration.keep, *self.shown.keep),
         )
         self.seed = self.stage.seed
+
+    def _updates(self, learner: SACLearner) -> dict[str, Any]:
+        """What of the stage's updates is other than its learner's."""
+        if self.exploration.learns:
+            return {}
+        if self.term is None:  # the model is fitted when all actions are known
+            return {"learning_starts": sys.maxsize}
+        return {"update": partial(learner.update_term, self.term)}
 
     def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
         """Train the synergy model to the end; returns the decoder for stage 2.

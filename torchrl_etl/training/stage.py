@@ -79,6 +79,8 @@ class Stage:
             episode. Intermediate steps get no entropy bonus. Default: 1.
         keep (sequence of NestedKey): further entries of a transition for the buffer.
         transforms (sequence of Transform): what each sampled batch goes through.
+        update (callable, optional): learns from a batch and returns scalars to log. Default:
+            ``learner.update``.
         prefill_size (int): transitions to make room for beside the budget. Default: 0.
         action_repeat (int): frames that a transition of the collector takes. Default: 1.
         restart_seed (int): another one collects other episodes with the same ``seed``, so that a
@@ -108,6 +110,7 @@ class Stage:
         n_steps: int = 1,
         keep: Sequence[NestedKey] = (),
         transforms: Sequence[Transform] = (),
+        update: Callable[[TensorDictBase], TensorDictBase] | None = None,
         prefill_size: int = 0,
         action_repeat: int = 1,
         restart_seed: int = 0,
@@ -120,6 +123,7 @@ class Stage:
         self.name, self.learner, self.seed, self.device = name, learner, seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
         self.restart_seed = restart_seed
+        self._update = learner.update if update is None else update
         self.replay_ratio, self.learning_starts = replay_ratio, learning_starts
         self.progress = Progress()
         self.batches: Batches | None = None
@@ -184,7 +188,7 @@ class Stage:
 
     def update(self) -> TensorDictBase:
         """One update on a sampled batch; returns scalars to log."""
-        return self.learner.update(self.buffer.sample().to(self.device))
+        return self._update(self.buffer.sample().to(self.device))
 
     def earn(self, transitions: int) -> None:
         """Owe the updates that the frames of so many transitions are worth."""

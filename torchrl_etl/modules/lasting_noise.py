@@ -1,0 +1,97 @@
+"""Standard normal noise that lasts: each step's is as drawn anew, only correlated with the others.
+
+A drawing is called once a step with the simulators in the same order, and draws for all of them
+every time, so that random numbers do not depend on which are used. Where an episode begins, nothing
+is left of the one before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchrl_etl.checks import check_positive, check_real
+
+__all__ = ["HeldNormal", "PinkNormal"]
+
+
+class HeldNormal:
+    """Drawn once and kept for k steps, P(k) ∝ k^-exponent, k ≤ longest (FlashSAC, 2026).
+
+    Args:
+        longest (int): most steps.
+        exponent (float): above 0; the larger, the shorter. Default: 2.
+
+    Raises:
+        ValueError: if exponent or longest are not positive.
+
+    Examples:
+        >>> held = HeldNormal(longest=16)
+        >>> held(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
+        torch.Size([4, 2])
+    """
+
+    def __init__(self, longest: int, exponent: float = 2.0) -> None:
+        check_real("(0, inf)", exponent=exponent)
+        check_positive(longest=longest)
+        self._chances = torch.arange(1, longest + 1, dtype=torch.float64).pow(-exponent)
+        self._noise: Tensor | None = None
+        self._left: Tensor | None = None
+
+    def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
+        """The noise of this step.
+
+        Args:
+            like (Tensor): of the shape [*, n] and dtype that it shall have.
+            begins (Tensor): where an episode begins, bool [*].
+        """
+        if self._noise is None or self._noise.shape != like.shape:
+            self._noise = torch.zeros_like(like)
+            self._left = torch.zeros_like(begins, dtype=torch.long)
+        lengths = 1 + torch.multinomial(self._chances, begins.numel(), replacement=True)
+        fresh = begins | (self._left == 0)
+        drawn = torch.randn_like(like)
+        self._left = torch.where(fresh, lengths.to(begins.device).view_as(begins), self._left) - 1
+        self._noise = torch.where(fresh.unsqueeze(-1), drawn, self._noise)
+        return self._noise
+
+
+class PinkNormal:
+    """Its power falls as 1 / frequency: the mean of processes whose time constants double.
+
+    The processes are autoregressive of first order and in their stationary distribution from the
+    first step of an episode on. Up to the longest, power times frequency stays within a factor of
+    1.7, for which others draw whole episodes by Fourier transforms (Eberhard 2023).
+
+    Equation: x_t = Σ_i y_i,t / √K with y_i,t+1 = a_i y_i,t + √(1 - a_i²) ε, a_i = exp(-2^-i) for i
+    from 0 to K - 1, so that the correlation over k steps is the mean of a_i^k.
+
+    Args:
+        longest (int): time constant of the slowest process in steps, brought down to a power of 2.
+
+    Raises:
+        ValueError: if longest is not positive.
+
+    Examples:
+        >>> pink = PinkNormal(longest=64)
+        >>> pink(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
+        torch.Size([4, 2])
+    """
+
+    def __init__(self, longest: int) -> None:
+        check_positive(longest=longest)
+        constants = 2.0 ** torch.arange(1 + int(math.log2(longest)))
+        self._kept = torch.exp(-1 / constants)
+        self._parts: Tensor | None = None
+
+    def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
+        """The noise of this step, see :class:`HeldNormal`."""
+        kept = self._kept.to(like).view(-1, *[1] * like.ndim)
+        drawn = torch.randn((len(kept), *like.shape), dtype=like.dtype, device=like.device)
+        if self._parts is None or self._parts.shape != drawn.shape:
+            self._parts = drawn
+        going_on = kept * self._parts + (1 - kept.square()).sqrt() * drawn
+        self._parts = torch.where(begins.unsqueeze(-1), drawn, going_on)
+        return self._parts.sum(0) / math.sqrt(len(kept))
