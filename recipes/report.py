@@ -25,7 +25,7 @@ DEFAULTS = {"results": "", "out": "", "frames": "", "control": "sac", "repetitio
 
 def main(arguments: Sequence[str]) -> None:
     settings = _settings(arguments)
-    with one_sentence(ValueError, OSError):
+    with one_sentence(ValueError, OSError, ImportError):
         frames = _count("frames", settings["frames"]) if settings["frames"] else None
         repetitions = _count("repetitions", settings["repetitions"])
         if not settings["results"]:

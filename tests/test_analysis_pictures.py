@@ -5,9 +5,9 @@ import csv
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
-from torchrl_etl.analysis import canvas
 from torchrl_etl.analysis.pictures import (
     _curve,
     embedding,
@@ -106,7 +106,7 @@ def test_a_failed_drawing_leaves_the_old_picture_and_no_litter(tmp_path, monkeyp
         target.write_bytes(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(canvas.Figure, "savefig", half_written)
+    monkeypatch.setattr(Figure, "savefig", half_written)
     with pytest.raises(OSError, match="disk full"):
         vaf_curve([1, 2], {"PCA": [0.1, 0.2]}, path)
     assert path.read_bytes() == before

@@ -1,3 +1,51 @@
-"""Explore to Learn (ETL) as TorchRL components: synergies for overactuated control."""
+"""Explore to Learn (ETL) as TorchRL components: synergies for overactuated control.
+
+What is asked for most is here by name, such as ``from torchrl_etl import SynergyAction``; it is
+imported when it is asked for, since TorchRL takes seconds.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchrl_etl.envs import make_env
+    from torchrl_etl.modules import GMVAE, SynergyDecoder
+    from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
+    from torchrl_etl.synergies import fit_gmvae, fit_synergies, load_bundle, save_bundle
+    from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, SynergyAction
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "envs": ("make_env",),
+    "modules": ("GMVAE", "SynergyDecoder"),
+    "objectives": ("LeanSACLoss", "SynergySACLoss"),
+    "synergies": ("fit_gmvae", "fit_synergies", "load_bundle", "save_bundle"),
+    "transforms": ("DirectionPrimer", "IntrinsicReward", "SynergyAction"),
+}
+
+__all__ = [
+    "GMVAE",
+    "DirectionPrimer",
+    "IntrinsicReward",
+    "LeanSACLoss",
+    "SynergyAction",
+    "SynergyDecoder",
+    "SynergySACLoss",
+    "fit_gmvae",
+    "fit_synergies",
+    "load_bundle",
+    "make_env",
+    "save_bundle",
+]
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint
 
 from torchrl_etl.checks import check_choice
@@ -23,6 +22,9 @@ from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder, facts
 from torchrl_etl.training.stage import Stage
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 __all__ = ["Experiment"]
 

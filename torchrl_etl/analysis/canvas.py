@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from torchrl_etl.extras import extra
 
-__all__ = ["DIRECTIONS", "FRAMES", "MARKERS", "SERIES", "new_figure", "tidy", "write"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+__all__ = ["MARKERS", "SERIES", "count_frames", "direction_colors", "new_figure", "tidy", "write"]
 
 # Okabe and Ito's colours, which stay apart under the common colour vision deficiencies; black
 # and yellow are left out, for text and for legibility. Markers tell series apart in grey.
@@ -19,12 +23,15 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 # A circle of hues that also goes round in lightness and from yellow to blue, so that opposite
 # directions differ for readers who do not tell red from green.
-DIRECTIONS = LinearSegmentedColormap.from_list(
-    "directions",
-    ["#D98200", "#A8324A", "#50206B", "#2A55C8", "#2FA3DD", "#7FD1AE", "#C9C443", "#D98200"],
-)
+_CIRCLE = ("#D98200", "#A8324A", "#50206B", "#2A55C8", "#2FA3DD", "#7FD1AE", "#C9C443", "#D98200")
 
-FRAMES = EngFormatter(sep="", places=None)
+
+@cache
+def direction_colors() -> Colormap:
+    """Colours of directions in the plane, by their angle in turns."""
+    with extra("pictures"):
+        from matplotlib.colors import LinearSegmentedColormap
+    return LinearSegmentedColormap.from_list("directions", _CIRCLE)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -34,6 +41,8 @@ def new_figure(width: float, height: float) -> Figure:
         >>> new_figure(6.0, 4.0).get_size_inches().tolist()
         [6.0, 4.0]
     """
+    with extra("pictures"):
+        from matplotlib.figure import Figure
     return Figure(figsize=(width, height), dpi=160, layout="constrained")
 
 
@@ -42,6 +51,13 @@ def tidy(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
+
+
+def count_frames(axes: Axes) -> None:
+    """Label the x axis with frames as 50k or 2M."""
+    with extra("pictures"):
+        from matplotlib.ticker import EngFormatter
+    axes.xaxis.set_major_formatter(EngFormatter(sep="", places=None))
 
 
 def write(figure: Figure, path: str | os.PathLike[str]) -> Path:

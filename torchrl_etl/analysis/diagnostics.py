@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from sklearn.decomposition import NMF, PCA
-from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
+
+from torchrl_etl.extras import extra
 
 if TYPE_CHECKING:
     from torchrl_etl.modules import GMVAE, SynergyDecoder
@@ -87,6 +87,8 @@ def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int
     """
     actions = _subsample(as_matrix(actions, "actions"), max_samples)
     _check_rank(num_synergies, actions)
+    with extra("synergies"):
+        from sklearn.decomposition import PCA
     # scikit-learn divides by the total variance on its way, which constant actions do not have;
     # the components are good either way.
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -134,6 +136,9 @@ def nmf_vaf(
             "actions' own spec as low."
         )
     shifted = shifted.clip(min=0.0)
+    with extra("synergies"):
+        from sklearn.decomposition import NMF
+        from sklearn.exceptions import ConvergenceWarning
     model = NMF(num_synergies, init="nndsvda", max_iter=500, random_state=0)
     with warnings.catch_warnings():
         # The last digits that more iterations would bring do not change a verdict.

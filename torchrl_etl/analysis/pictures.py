@@ -11,16 +11,18 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from torchrl_etl.analysis.canvas import FRAMES, MARKERS, SERIES, new_figure, tidy, write
+from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figure, tidy, write
 from torchrl_etl.analysis.diagnostics import synergy_effects
 from torchrl_etl.analysis.state_space import embedding
 from torchrl_etl.analysis.statistics import interval
 from torchrl_etl.modules import SynergyDecoder
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["embedding", "learning_curves", "synergy_heatmap", "vaf_curve"]
 
@@ -94,7 +96,7 @@ def learning_curves(
             axes.set_ylim(-3, 103)
         axes.set_xlabel("environment frames, explore stage included")
         axes.set_ylabel(label)
-        axes.xaxis.set_major_formatter(FRAMES)
+        count_frames(axes)
     handles, labels = axes.get_legend_handles_labels()
     if labels:
         figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)

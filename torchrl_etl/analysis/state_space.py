@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
-from sklearn.decomposition import PCA
 from torch import Tensor
 
-from torchrl_etl.analysis.canvas import DIRECTIONS, new_figure, tidy, write
+from torchrl_etl.analysis.canvas import direction_colors, new_figure, tidy, write
 from torchrl_etl.analysis.diagnostics import as_matrix
+from torchrl_etl.extras import extra
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["embedding"]
 
@@ -77,14 +80,14 @@ def embedding(
 
 
 def _histogram(axes: Axes, points: np.ndarray, positive: np.ndarray) -> None:
-    edges = np.histogram_bin_edges(points, bins=40)
+    edges, colors = np.histogram_bin_edges(points, bins=40), direction_colors()
     for chosen, name, where, hatch in ((~positive, "−1", 0.5, "//"), (positive, "+1", 0.0, None)):
         axes.hist(
             points[chosen],
             edges,
             label=name,
-            facecolor=(*DIRECTIONS(where)[:3], 0.55),
-            edgecolor=DIRECTIONS(where),
+            facecolor=(*colors(where)[:3], 0.55),
+            edgecolor=colors(where),
             histtype="stepfilled",
             hatch=hatch,
         )
@@ -96,6 +99,8 @@ def _histogram(axes: Axes, points: np.ndarray, positive: np.ndarray) -> None:
 def _scatter(axes: Axes, points: np.ndarray, arrows: np.ndarray) -> None:
     labels = ["embedding dimension 1", "embedding dimension 2"]
     if points.shape[1] > 2:
+        with extra("pictures"):
+            from sklearn.decomposition import PCA
         # An encoder that has collapsed to a point has no variance to divide by.
         with np.errstate(invalid="ignore"):
             model = PCA(2, svd_solver="covariance_eigh").fit(points)
@@ -113,7 +118,7 @@ def _scatter(axes: Axes, points: np.ndarray, arrows: np.ndarray) -> None:
 def _colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Hue from the angle; grey as the part of the unit vector in the plane gets short."""
     length = np.hypot(x, y).clip(max=1.0)[..., None]
-    hues = DIRECTIONS(np.arctan2(y, x) / (2 * np.pi) % 1.0)[..., :3]
+    hues = direction_colors()(np.arctan2(y, x) / (2 * np.pi) % 1.0)[..., :3]
     return length * hues + (1 - length) * _GREY
 
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import DegenerateDataWarning, binomtest, bootstrap
+
+from torchrl_etl.extras import extra
 
 __all__ = ["Interval", "interval", "success_interval"]
 
@@ -61,6 +62,8 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
     mean = float(array.mean())
     if array.size == 1:
         return Interval(mean, float("nan"), float("nan"))
+    with extra("statistics"):
+        from scipy.stats import DegenerateDataWarning, bootstrap
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings():
             # A degenerate BCa divides zero by zero on its way to the NaN that is handled below.
@@ -104,6 +107,8 @@ def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.
             "Some outcomes are neither 0 nor 1; pass one boolean per episode, or use interval() "
             "for a mean of other numbers."
         )
+    with extra("statistics"):
+        from scipy.stats import binomtest
     count = int(array.sum())
     ends = binomtest(count, array.size).proportion_ci(confidence, method="wilson")
     return Interval(count / array.size, float(ends.low), float(ends.high))

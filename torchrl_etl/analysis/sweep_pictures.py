@@ -10,12 +10,11 @@ import os
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from torchrl_etl.analysis.canvas import FRAMES, MARKERS, SERIES, new_figure, tidy, write
+from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figure, tidy, write
 from torchrl_etl.analysis.published import (
     PublishedCurve,
     caveats,
@@ -24,6 +23,9 @@ from torchrl_etl.analysis.published import (
 )
 from torchrl_etl.analysis.sweep_results import SweepRun
 from torchrl_etl.analysis.sweep_statistics import OverallResult, mean_band
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["looks", "overall_picture", "task_picture"]
 
@@ -118,7 +120,7 @@ def task_picture(
             axes.set_ylim(-3, 103)
         axes.set_xlabel("environment frames, exploration included")
         axes.set_ylabel(label)
-        axes.xaxis.set_major_formatter(FRAMES)
+        count_frames(axes)
         for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, handle)
     figure.legend(

@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rliable import library, metrics
-from scipy.stats import bootstrap
 
 from torchrl_etl.analysis.published import best_published, environment_id
 from torchrl_etl.analysis.statistics import Interval
 from torchrl_etl.analysis.sweep_results import SweepRun
+from torchrl_etl.extras import extra
 
 __all__ = [
     "Comparison",
@@ -109,6 +108,8 @@ def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarra
     """
     if len(values) < 3:
         return values.min(axis=0), values.max(axis=0)
+    with extra("statistics"):
+        from scipy.stats import bootstrap
     ends = bootstrap(
         (values,),
         np.mean,
@@ -365,6 +366,8 @@ def _stale(run: SweepRun, budget: int) -> bool:
 
 
 def _pooled_iqm(*groups: np.ndarray) -> np.ndarray:
+    with extra("statistics"):
+        from rliable import metrics
     return np.array([metrics.aggregate_iqm(np.concatenate(groups))])
 
 
@@ -382,6 +385,8 @@ def _interval(
     point = float(statistic(*groups)[0])
     if repetitions == 0 or min(map(len, groups)) < 2:
         return Interval(point, math.nan, math.nan)
+    with extra("statistics"):
+        from rliable import library
     # One array per task rather than one matrix: numbers of seeds may differ.
     scores = [group[:, None] for group in groups]
     with _seeded():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import kmedoids
-import mujoco
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,10 @@ from torchrl.envs import EnvBase, step_mdp
 
 from torchrl_etl.checks import check_positive
 from torchrl_etl.envs import body_joints, mujoco_state
+from torchrl_etl.extras import extra
+
+if TYPE_CHECKING:
+    import mujoco
 
 __all__ = ["group_muscles", "record_muscle_lengths"]
 
@@ -135,6 +139,8 @@ def group_muscles(
     chunks = torch.nn.functional.normalize(chunks, dim=-1)
     similarity = (chunks @ chunks.mT).mean(0)
     distance = (1 - similarity).clamp_min(0).numpy()
+    with extra("rivals"):
+        import kmedoids
     runs = (
         kmedoids.fasterpam(distance, num_groups, init="random", random_state=seed + i, n_cpu=1)
         for i in range(restarts)
@@ -156,6 +162,8 @@ class _Held:
     """
 
     def __init__(self, model: mujoco.MjModel, state: mujoco.MjData) -> None:
+        import mujoco  # there, since its model is
+
         self._model, self._state = model, state
         own = body_joints(model, state)
         held = ~own | (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.extras import extra
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.modules.synergy_decoder import SynergyMap
 
@@ -149,9 +150,10 @@ class SARDecoder(SynergyMap):
         _check_blend(blend)
         _check_actions(actions, num_synergies, low, high)
         # Takes a second to import, which a worker that only decodes should not spend.
-        from sklearn.decomposition import PCA, FastICA
-        from sklearn.pipeline import make_pipeline
-        from sklearn.preprocessing import MinMaxScaler
+        with extra("rivals"):
+            from sklearn.decomposition import PCA, FastICA
+            from sklearn.pipeline import make_pipeline
+            from sklearn.preprocessing import MinMaxScaler
 
         chain = make_pipeline(
             PCA(num_synergies, random_state=seed),

@@ -119,9 +119,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 f"replacements must be an integer of at least 0, got {replacements!r}."
             )
         if importlib.util.find_spec("ray") is None:
-            raise ImportError(
-                "RayWorkers needs Ray: pip install 'ray>=2.50' (or torchrl_etl[ray])."
-            )
+            raise ImportError("RayWorkers needs Ray: pip install 'torchrl_etl[ray]'.")
         self.create_env_fn, self.seed, self.started = create_env_fn, seed, 0
         self.replacements = replacements
         self._prepare(policy, sync, total_frames, timeout)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import mujoco
+from typing import TYPE_CHECKING
+
 import numpy as np
 from torchrl.envs import EnvBase
 
 from torchrl_etl.envs.simulator import mujoco_state
+
+if TYPE_CHECKING:
+    import mujoco
 
 __all__ = ["body_joints", "has_free_root"]
 
@@ -27,6 +31,8 @@ def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         >>> body_joints(*mujoco_state(env))
         array([ True,  True])
     """
+    import mujoco  # there, since its model is
+
     moments = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
         moments,
@@ -56,5 +62,7 @@ def has_free_root(env: EnvBase) -> bool:
     except ValueError:
         return False
     env.reset()
+    import mujoco
+
     free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
     return bool((free & body_joints(model, data)).any())

@@ -29,6 +29,7 @@ from torchrl_etl.envs.wrappers import (
     RepeatedAction,
     SeededVectorEnv,
 )
+from torchrl_etl.extras import extra
 
 __all__ = ["actuator_names", "make_env"]
 
@@ -246,8 +247,9 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
     """Builds the environment, its action flat; also returns what it raises when it diverges."""
     if task.suite == "dm_control":
         suite = dm_control_suite()
-        from dm_control.rl.control import PhysicsError
-        from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+        with extra("dm_control"):
+            from dm_control.rl.control import PhysicsError
+            from shimmy.dm_control_compatibility import DmControlCompatibilityV0
 
         domain, task_name = task.env_id.split("-", 1)
         env = DmControlCompatibilityV0(suite.load(domain, task_name, **env_kwargs))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -53,6 +52,8 @@ def joint_torques(
         (23, 39)
     """
     model, now = mujoco_state(env)
+    import mujoco  # there, since its model is
+
     if model.na != model.nu or (model.actuator_dyntype != mujoco.mjtDyn.mjDYN_MUSCLE).any():
         raise ValueError(
             f"{model.nu} actuators with {model.na} activations came, and not all are muscles; "
@@ -95,6 +96,8 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
 
 def _active_torques(model: Any, data: Any, simple: np.ndarray) -> np.ndarray:
     """Of each muscle alone on each hinge or slide in one posture [J, n], less what is passive."""
+    import mujoco
+
     torques = []
     data.qvel[:] = 0.0
     for activation in (np.zeros(model.na), *np.eye(model.na)):
@@ -109,6 +112,8 @@ def _tied(model: Any, data: Any) -> np.ndarray:
 
     Brings the tied ones in ``data`` to where their equalities want them.
     """
+    import mujoco
+
     moves = np.eye(model.njnt)
     for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         tied, free = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])

@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from torchrl_etl.extras import extra
+
 __all__ = ["register_myosuite"]
 
 _RECIPE = "torchrl_etl_hand"
@@ -24,7 +26,8 @@ def register_myosuite() -> None:
     it takes postures again, with Key Turn's key taken away: on the fixed goal observations,
     rewards and contacts are then those of MyoSuite 2.5 and 2.12. Targets are not drawn.
     """
-    import myosuite  # noqa: F401  (importing it registers its environments)
+    with extra("myosuite"):
+        import myosuite  # noqa: F401  (importing it registers its environments)
     from myosuite.core.model_builder import get_recipe, list_recipes, model_recipe
 
     if _RECIPE in list_recipes():

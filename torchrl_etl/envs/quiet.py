@@ -7,6 +7,8 @@ import warnings
 from collections.abc import Iterator
 from types import ModuleType
 
+from torchrl_etl.extras import extra
+
 __all__ = ["dm_control_suite", "quiet_compiler"]
 
 _HARMLESS = (
@@ -22,7 +24,11 @@ def quiet_compiler() -> Iterator[None]:
     MuJoCo otherwise writes its compiler's warnings to stderr and to a file in the working
     directory. Unknown ones become Python warnings.
     """
-    import mujoco
+    try:
+        import mujoco
+    except ModuleNotFoundError:
+        yield
+        return
 
     def report(message: str) -> None:
         if not message.startswith(_HARMLESS):
@@ -43,5 +49,6 @@ def dm_control_suite() -> ModuleType:
     """Imports DMControl's suite, without its complaint that a machine has no screen."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing")
-        from dm_control import suite
+        with extra("dm_control"):
+            from dm_control import suite
     return suite

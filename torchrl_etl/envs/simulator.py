@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 from torchrl.envs import EnvBase, GymWrapper
 
 __all__ = ["mujoco_state", "simulator"]
@@ -41,6 +41,7 @@ def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
     if hasattr(inner, "physics"):  # DMControl
         return inner.physics.model.ptr, inner.physics.data.ptr
     model, data = getattr(inner, "model", None), getattr(inner, "data", None)
-    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+    mujoco = sys.modules.get("mujoco")  # whatever runs on it has imported it
+    if mujoco and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         return model, data
     raise ValueError(f"{type(inner).__name__} does not run on MuJoCo, so it cannot be drawn.")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.extras import extra
 from torchrl_etl.synergies.affine import AffineSynergies
 
 __all__ = ["NMFSynergies"]
@@ -56,7 +57,8 @@ class NMFSynergies(AffineSynergies):
 
     def factorize(self, actions: np.ndarray) -> np.ndarray:
         # Takes a second to import, which a worker that only decodes should not spend.
-        from sklearn.decomposition import NMF
+        with extra("synergies"):
+            from sklearn.decomposition import NMF
 
         self.model = NMF(self.num_synergies, init="nndsvda", max_iter=self.max_iter, random_state=0)
         above = self._above_low(actions)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_etl.extras import extra
 from torchrl_etl.modules.synergy_decoder import NEAREST
 from torchrl_etl.synergies.affine import AffineSynergies
 
@@ -37,7 +38,8 @@ class PCASynergies(AffineSynergies):
 
     def factorize(self, actions: np.ndarray) -> np.ndarray:
         # Takes a second to import, which a worker that only decodes should not spend.
-        from sklearn.decomposition import PCA
+        with extra("synergies"):
+            from sklearn.decomposition import PCA
 
         before = self._before_bounds(torch.as_tensor(actions)).numpy()
         # It divides by the total variance on its way, which constant actions do not have.

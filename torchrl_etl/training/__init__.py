@@ -1,13 +1,17 @@
 """What runs a learner: a stage, the loop around it, checkpoints, evaluation, queues of runs."""
 
+from typing import TYPE_CHECKING, Any
+
 from torchrl_etl.training.config import validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import Interrupted
-from torchrl_etl.training.resumed import resumed_config
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.sweep import Run, Sweep
 from torchrl_etl.training.video import check_video_size, record_episodes
+
+if TYPE_CHECKING:
+    from torchrl_etl.training.resumed import resumed_config
 
 __all__ = [
     "Context",
@@ -22,3 +26,11 @@ __all__ = [
     "resumed_config",
     "validate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "resumed_config":  # needs Hydra, which running a stage does not
+        from torchrl_etl.training.resumed import resumed_config
+
+        return resumed_config
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import torch
-from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torchrl_etl.checks import (
     check_choice,
@@ -16,6 +17,10 @@ from torchrl_etl.checks import (
 )
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
+from torchrl_etl.extras import extra
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 __all__ = ["MAY_CHANGE", "RENAMED", "bfloat16_warning", "validate"]
 
@@ -85,6 +90,8 @@ def validate(config: DictConfig) -> None:
     Raises:
         ValueError: naming the key, what came and what is expected.
     """
+    with extra("recipes"):
+        from omegaconf import OmegaConf
     for name in ("env", "run_dir", "device"):
         if not isinstance(config[name], str) or not config[name]:
             raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
@@ -93,7 +100,7 @@ def validate(config: DictConfig) -> None:
         pictures=config.pictures,
         **{"learn.prefill": config.learn.prefill, "collector.ahead": config.collector.ahead},
     )
-    if not isinstance(config.env_kwargs, DictConfig):
+    if not isinstance(config.env_kwargs, Mapping):
         raise ValueError(
             f"env_kwargs is {config.env_kwargs!r}; it must be arguments by name, such as "
             "env_kwargs={NAME: VALUE}."
@@ -163,12 +170,12 @@ def _check_collector(collector: DictConfig) -> None:
         )
     if collector.kind == "ray" and find_spec("ray") is None:
         raise ValueError(
-            "collector.kind is 'ray', which is not installed; pip install 'ray>=2.50'."
+            "collector.kind is 'ray', which is not installed; pip install 'torchrl_etl[ray]'."
         )
 
 
 def _check_loggers(names: object) -> None:
-    if not isinstance(names, ListConfig):
+    if isinstance(names, str) or not isinstance(names, Sequence):
         raise ValueError(f"log is {names!r}; it must be a list, such as [tensorboard].")
     for name in names:
         check_choice("log", name, _LOGGERS)

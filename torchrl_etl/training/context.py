@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Transform
@@ -16,10 +15,14 @@ from torchrl.envs.transforms import Transform
 from torchrl_etl.checks import check_integer, naming
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.extras import extra
 from torchrl_etl.learners import SACLearner, build_learner
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage, frames_per_action
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 __all__ = ["Context"]
 
@@ -52,6 +55,8 @@ class Context:
 
     def options(self, section: str) -> dict[str, Any]:
         """A section of the configuration as plain keyword arguments."""
+        with extra("recipes"):
+            from omegaconf import OmegaConf
         return OmegaConf.to_container(OmegaConf.select(self.config, section), resolve=True)
 
     def make_env(self, **options: Any) -> EnvBase:

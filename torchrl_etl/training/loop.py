@@ -8,15 +8,19 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import FrameType, TracebackType
+from typing import TYPE_CHECKING
 
 from tensordict import TensorDictBase
-from tqdm import tqdm
 
 from torchrl_etl.collectors import STOP_SIGNALS
+from torchrl_etl.extras import extra
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 __all__ = ["Interrupted", "StopOnSignal", "run_stage"]
 
@@ -111,6 +115,8 @@ def run_stage(
     if stage.finished:
         return None
 
+    with extra("recipes"):
+        from tqdm import tqdm
     bar = tqdm(
         total=stage.budget,
         initial=stage.frames,

@@ -12,15 +12,18 @@ import platform
 import subprocess
 import uuid
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
-from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
+from torchrl_etl.extras import extra
 from torchrl_etl.io import write_atomically
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 __all__ = ["RunFolder", "facts"]
 
@@ -50,6 +53,8 @@ class RunFolder:
             FileExistsError: if the folder already holds a run and ``resume`` is False.
             OSError: if the folder cannot be written.
         """
+        with extra("recipes"):
+            from omegaconf import OmegaConf
         try:
             if self._unique and not resume:
                 self.path = _claimed(self.path)
@@ -168,6 +173,8 @@ class RunFolder:
         """What tells this run from others in a logger's own list of them."""
         if name == "mlflow":  # has a store of its own in every run folder
             return {}
+        from omegaconf import OmegaConf
+
         config = OmegaConf.to_container(self._config, resolve=True)
         if name == "trackio":  # knows a run again by its name
             return {"config": config}
@@ -222,9 +229,16 @@ def facts() -> dict[str, Any]:
         "torchrl_etl": version("torchrl_etl"),
         "commit": _commit(),
         "python": platform.python_version(),
-        **{name: version(name) for name in _PACKAGES},
+        **{name: version(name) for name in _PACKAGES if _is_installed(name)},
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return bool(version(package))
+    except PackageNotFoundError:
+        return False
 
 
 def _finite(content: Any) -> Any:

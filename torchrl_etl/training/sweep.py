@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from omegaconf import OmegaConf
 
 from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
@@ -71,6 +70,8 @@ class Run:
     @property
     def folder(self) -> RunFolder | None:
         """What it logged, once it has begun."""
+        from omegaconf import OmegaConf
+
         begun = (self.path / "config.yaml").is_file()
         # Its series are read every second; its configuration, 30 ms to parse, is not needed.
         return RunFolder(self.path, OmegaConf.create()) if begun else None
@@ -78,6 +79,8 @@ class Run:
     @cached_property
     def episodes(self) -> int:
         """Of each evaluation; there is a configuration to read it from."""
+        from omegaconf import OmegaConf
+
         return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
     def start(self, environ: Mapping[str, str]) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v2 as imageio
-import mujoco
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_etl.envs import mujoco_state
+from torchrl_etl.extras import extra
 from torchrl_etl.training.evaluation import EVALUATION_SEED
 
 __all__ = ["check_video_size", "record_episodes"]
@@ -77,6 +76,9 @@ def record_episodes(
         ValueError: if the environment does not run on MuJoCo or has no such camera.
     """
     model, data = mujoco_state(env)
+    with extra("video"):
+        import imageio.v2 as imageio
+        import mujoco
     cameras = [model.camera(i).name for i in range(model.ncam)]
     if camera is not None and camera not in cameras:
         raise ValueError(f"There is no camera {camera!r}; the model has {', '.join(cameras)}.")

@@ -1,0 +1,36 @@
+"""Packages that only some parts need, and the extra of this one that installs them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+__all__ = ["extra"]
+
+
+@contextlib.contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Where packages are imported that ``pip install torchrl_etl[name]`` brings.
+
+    Args:
+        name (str): of the extra in ``pyproject.toml``.
+
+    Raises:
+        ImportError: naming the package and the extra, if one is missing.
+
+    Examples:
+        >>> with extra("pictures"):
+        ...     import not_installed
+        Traceback (most recent call last):
+        ...
+        ImportError: not_installed is needed here and not installed; pip install
+        'torchrl_etl[pictures]' brings it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"{error.name} is needed here and not installed; pip install 'torchrl_etl[{name}]' "
+            "brings it.",
+            name=error.name,
+        ) from error
