@@ -119,7 +119,7 @@ class TestSynergyAction(TransformChecks):
             nn.Sequential(network, self.transform()),
             TensorDictSequential(network, self.transform()),
         ):
-            with pytest.raises(RuntimeError, match="the decoder itself"):
+            with pytest.raises(RuntimeError, match="the module itself"):
                 model(data)
 
     def test_replay_buffer(self):

@@ -12,7 +12,12 @@ if TYPE_CHECKING:
     from torchrl_etl.modules import GMVAE, SynergyDecoder
     from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
     from torchrl_etl.synergies import fit_gmvae, fit_synergies, load_bundle, save_bundle
-    from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, SynergyAction
+    from torchrl_etl.transforms import (
+        DirectionPrimer,
+        IntrinsicReward,
+        LatentAction,
+        SynergyAction,
+    )
 
 __version__ = "0.1.0"
 
@@ -21,13 +26,14 @@ _HOMES = {
     "modules": ("GMVAE", "SynergyDecoder"),
     "objectives": ("LeanSACLoss", "SynergySACLoss"),
     "synergies": ("fit_gmvae", "fit_synergies", "load_bundle", "save_bundle"),
-    "transforms": ("DirectionPrimer", "IntrinsicReward", "SynergyAction"),
+    "transforms": ("DirectionPrimer", "IntrinsicReward", "LatentAction", "SynergyAction"),
 }
 
 __all__ = [
     "GMVAE",
     "DirectionPrimer",
     "IntrinsicReward",
+    "LatentAction",
     "LeanSACLoss",
     "SynergyAction",
     "SynergyDecoder",

@@ -2,6 +2,7 @@
 
 from torchrl_etl.transforms.direction import DirectionPrimer
 from torchrl_etl.transforms.intrinsic_reward import IntrinsicReward
+from torchrl_etl.transforms.latent_action import LatentAction
 from torchrl_etl.transforms.redraw_direction import RedrawDirection
 from torchrl_etl.transforms.rnd_bonus import RNDBonus
 from torchrl_etl.transforms.scaled_bonus import ScaledBonus
@@ -10,6 +11,7 @@ from torchrl_etl.transforms.synergy_action import SynergyAction
 __all__ = [
     "DirectionPrimer",
     "IntrinsicReward",
+    "LatentAction",
     "RNDBonus",
     "RedrawDirection",
     "ScaledBonus",

@@ -1,0 +1,75 @@
+"""LatentAction passes what SynergyAction passes, with modules and specs of any kind."""
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests import test_transforms_synergy_action as synergy
+from tests.point_env import ACTION_DIM, PointEnv
+from torchrl_etl.transforms import LatentAction
+
+SPEC = Bounded(-1, 1, shape=(synergy.D,))
+
+
+def fixed_module(key="action"):
+    """The network of the decoder that the checks of values know, without its attributes."""
+    return TensorDictModule(synergy.fixed_decoder().module, ["z"], [key])
+
+
+class TestLatentAction(synergy.TestSynergyAction):
+    synergy_key = "latent"
+
+    @staticmethod
+    def transform(nested=False):
+        if nested:
+            return LatentAction(
+                fixed_module(("agent", "action")),
+                SPEC,
+                latent_key=("agent", "latent"),
+                executed_key=("agent", "executed_action"),
+            )
+        return LatentAction(fixed_module(), SPEC)
+
+    # Collectors in other processes start slowly and would tell nothing beyond the parent class.
+    test_two_collector_workers_collect = None
+
+
+def shifting(size, shape=()):
+    """``size`` moves to choose from, by their number."""
+    moves = nn.Embedding(size, ACTION_DIM)
+    torch.nn.init.uniform_(moves.weight, -1, 1)
+    return TensorDictModule(moves, ["z"], ["action"]), Categorical(size, shape=shape)
+
+
+@pytest.mark.parametrize("batch_size", [(), (3,)])
+def test_a_latent_of_numbered_choices_moves_the_env_by_its_rows(batch_size):
+    module, spec = shifting(4)
+    env = TransformedEnv(PointEnv(batch_size), LatentAction(module, spec))
+    check_env_specs(env)
+    rollout = env.rollout(3)
+    assert rollout["latent"].shape == (*batch_size, 3)
+    expected = module.module.weight.detach()[rollout["latent"]]
+    assert torch.equal(rollout["next", "executed_action"], expected)
+
+
+@pytest.mark.parametrize("place", [lambda t: t, lambda t: Compose(StepCounter(), t)])
+def test_a_module_of_another_width_is_refused_at_attachment(place):
+    module = TensorDictModule(nn.Linear(synergy.D, 7), ["z"], ["action"])
+    with pytest.raises(ValueError, match=r"makes actions of shape \[7\] .* 'action' has \[5\]"):
+        TransformedEnv(PointEnv(), place(LatentAction(module, SPEC)))
+
+
+def test_a_module_without_keys_or_with_two_inputs_is_refused():
+    with pytest.raises(TypeError, match="Linear without keys; wrap it"):
+        LatentAction(nn.Linear(2, 5), SPEC)
+    with pytest.raises(ValueError, match=r"reads \['a', 'b'\]"):
+        LatentAction(TensorDictModule(torch.add, ["a", "b"], ["action"]), SPEC)
+
+
+def test_repr_names_module_and_keys():
+    shown = repr(LatentAction(fixed_module(), SPEC))
+    assert shown.startswith("LatentAction(TensorDictModule, latent_key='latent', action_key=")

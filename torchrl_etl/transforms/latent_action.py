@@ -1,0 +1,329 @@
+"""A latent space as the action space: a module decodes what the policy writes for the env."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Composite, ReplayBuffer, TensorSpec
+from torchrl.envs.transforms import ModuleTransform, TransformedEnv
+
+from torchrl_etl.transforms.keys import group_reset, private_key, set_leaf
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+    from torchrl.envs.transforms import Transform
+
+__all__ = ["LatentAction"]
+
+
+class LatentAction(ModuleTransform):
+    """Lets a policy act in the latent space of a module that decodes actions.
+
+    The action spec of the transformed env is ``latent_spec``; at each step the inverse pass runs
+    the module on the latent action and the env executes what comes out, without gradients.
+
+    In a collector's batches root ``latent`` and root ``action`` belong together, as they would if
+    the policy ended in the module, and stay together under n-step returns. What the simulator
+    executed in the end, after clips and scalings between it and this transform, is
+    ``("next", "executed_action")``; root ``executed_action`` is that of the step before.
+
+    ``env.step``, ``env.rollout`` and the workers of ``SerialEnv`` and ``ParallelEnv`` cannot write
+    to the root, and leave ``action`` out. There the pair is root ``latent`` and
+    ``("next", "executed_action")``, and before n-step returns
+    ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)`` brings it to
+    the root.
+
+    The module is held by reference: changing its weights in place changes the next step. It is a
+    submodule, so ``state_dict()`` holds it and attaching moves it to the env's device and to eval
+    mode, as TorchRL does with every module; give a copy where the learner trains its own. In
+    another process the module is the copy made when the worker started.
+
+    Replay buffers call a transform's inverse on ``extend``; attached to one, LatentAction would
+    overwrite recorded actions, so it refuses.
+
+    Args:
+        module (TensorDictModuleBase): reads one latent action and writes one action, which keeps
+            to the bounds of the env's.
+        latent_spec (TensorSpec): of one latent action, unbatched: what the policy is to write.
+
+    Keyword Args:
+        latent_key (NestedKey): what the policy writes. ``"action"`` serves policies that know no
+            other key; the recorded ``"action"`` is then the latent one. Default: ``"latent"``.
+        executed_key (NestedKey): where the executed action is recorded.
+            Default: ``"executed_action"``.
+        action_key (NestedKey, optional): the base env's action. Default: the module's out-key.
+        decoded_key (NestedKey, optional): where a collector's batch has the decoded action.
+            Default: ``action_key``, and ``"decoded_action"`` beside it where the latent one is
+            there.
+
+    Keys:
+        reads ``latent`` [*, d] of ``latent_spec``; writes ``("next", "executed_action")``, of the
+        base env's action spec, at reset ``executed_action``, zeros brought into the bounds, and,
+        under a collector, ``action`` [*, n]. In a group of agents all of them lie in the group, if
+        their keys say so.
+
+    Raises:
+        TypeError: if the module lacks keys, or the transform meets a replay buffer.
+        ValueError: if keys collide; when attached to an env, if the env has no such action key or
+            the module's actions have another shape.
+        RuntimeError: if called forward: there is no way back from actions here.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_etl.transforms import LatentAction
+        >>> mean = TensorDictModule(lambda z: 2 * z.mean(-1, True), ["latent"], ["action"])
+        >>> latent_action = LatentAction(mean, Bounded(-1, 1, shape=(3,)))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), latent_action)
+        >>> env.action_keys, env.full_action_spec["latent"].shape
+        (['latent'], torch.Size([3]))
+        >>> rollout = env.rollout(5)
+        >>> bool((rollout["next", "executed_action"] == 2 * rollout["latent"].mean(-1, True)).all())
+        True
+    """
+
+    def __init__(
+        self,
+        module: TensorDictModuleBase,
+        latent_spec: TensorSpec,
+        *,
+        latent_key: NestedKey = "latent",
+        executed_key: NestedKey = "executed_action",
+        action_key: NestedKey | None = None,
+        decoded_key: NestedKey | None = None,
+    ) -> None:
+        if not hasattr(module, "in_keys") or not hasattr(module, "out_keys"):
+            raise TypeError(
+                f"The module is a {type(module).__name__} without keys; wrap it, as in "
+                "TensorDictModule(module, in_keys=['latent'], out_keys=['action'])."
+            )
+        if len(module.in_keys) != 1 or len(module.out_keys) != 1:
+            raise ValueError(
+                f"The module reads {list(module.in_keys)} and writes {list(module.out_keys)}; it "
+                "must read one latent action and write one action."
+            )
+        super().__init__(module=module, inverse=True, no_grad=True)
+        self.latent_spec, self.latent_key = latent_spec, unravel_key(latent_key)
+        self.executed_key = unravel_key(executed_key)
+        self.action_key = unravel_key(module.out_keys[0] if action_key is None else action_key)
+        if decoded_key is None:
+            taken = self.action_key == self.latent_key
+            decoded_key = _beside(self.action_key, "decoded_action") if taken else self.action_key
+        self.decoded_key = unravel_key(decoded_key)
+        if self.executed_key in (self.latent_key, self.action_key):
+            raise ValueError(
+                f"executed_key is {self.executed_key!r}, which already names the latent or the "
+                "action; choose a key of its own, such as 'executed_action'."
+            )
+        if self.decoded_key in (self.latent_key, self.executed_key):
+            raise ValueError(
+                f"decoded_key is {self.decoded_key!r}, which already names the latent or the "
+                "executed action; choose a key of its own, such as 'decoded_action'."
+            )
+
+    def _in_keys_inv(self) -> list[NestedKey]:
+        return [self.action_key]
+
+    def _out_keys_inv(self) -> list[NestedKey]:
+        return [self.latent_key]
+
+    @property
+    def _decoded_copy(self) -> NestedKey:
+        # Seen by ``_step`` only. The action key will not do: an inner transform, such as an action
+        # scaling, rewrites it on the way to the env.
+        return private_key(self.executed_key, self.decoded_key)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        latent = tensordict.get(self.latent_key, None)
+        if latent is None:
+            if self.missing_tolerance:
+                return tensordict
+            raise KeyError(
+                f"{type(self).__name__} reads {self.latent_key!r}, but the tensordict has only "
+                f"{sorted(map(str, tensordict.keys(True, True)))}; let the policy write it."
+            )
+        action = self.decode(latent)
+        tensordict.set(self.action_key, action)
+        return tensordict.set(self._decoded_copy, action)
+
+    @torch.no_grad()
+    def decode(self, latent: Tensor) -> Tensor:
+        """Actions [*, n] for latent actions [*, d], in the env's dtype."""
+        batch_size = latent.shape[: latent.ndim - self.latent_spec.ndim]
+        entry = self.module(TensorDict({self.module.in_keys[0]: latent}, batch_size))
+        action = entry.get(self.module.out_keys[0])
+        return action if self.parent is None else action.to(self._action_leaf.dtype)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            f"{type(self).__name__} acts in the inverse pass of an env only; to decode elsewhere "
+            "call its inv(tensordict) or the module itself."
+        )
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        # ``tensordict`` is the copy that the inverse passes of all transforms worked on.
+        decoded = tensordict.get(self._decoded_copy)
+        if isinstance(self.collector, Collector):
+            # The copy's root is lost, and so is that of the step where a collector takes data from
+            # device to device; this is the one that it stores.
+            self.collector._carrier.set(self.decoded_key, decoded)
+        executed = decoded if self._base_key is None else tensordict.get(self._base_key)
+        return next_tensordict.set(self.executed_key, executed.to(self._executed_leaf.dtype))
+
+    def transform_fake_tensordict(self, fake_tensordict: TensorDictBase) -> TensorDictBase:
+        if isinstance(self.collector, Collector):
+            fake_tensordict.set(self.decoded_key, self._action_leaf.zero())
+        return fake_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset.set(self.executed_key, self.rest(tensordict_reset.batch_size))
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Here nobody merges by the reset mask for us.
+        rest = self.rest(tensordict_reset.batch_size)
+        reset = group_reset(self.parent, tensordict, self.executed_key)
+        present = tensordict.get(self.executed_key)
+        return tensordict_reset.set(
+            self.executed_key, torch.where(expand_as_right(reset, rest), rest, present)
+        )
+
+    def rest(self, batch_size: torch.Size) -> Tensor:
+        """What counts as executed before the first step: zeros brought into the bounds."""
+        leaf = self._executed_leaf
+        rest = leaf.zero()
+        if isinstance(leaf, Bounded):
+            rest = rest.clamp(leaf.space.low, leaf.space.high)
+        # An env that is not batch-locked leaves the batch size to the data.
+        return rest.expand(*batch_size, *rest.shape[self.parent.ndim :]).clone()
+
+    @property
+    def _action_leaf(self) -> TensorSpec:
+        return self.parent.full_action_spec[self.action_key]
+
+    @property
+    def _base_key(self) -> NestedKey | None:
+        """The simulator's name for the action, or None where that is not known."""
+        keys = self.parent.base_env.action_keys
+        if self.action_key in keys:
+            return self.action_key
+        return keys[0] if len(keys) == 1 else None
+
+    @property
+    def _executed_leaf(self) -> TensorSpec:
+        key = self._base_key
+        return self._action_leaf if key is None else self.parent.base_env.full_action_spec[key]
+
+    def transform_action_spec(self, action_spec: Composite) -> Composite:
+        leaf = action_spec[self.action_key]
+        latent_spec = self.latent_spec.expand(*leaf.shape[:-1], *self.latent_spec.shape)
+        latent_spec = latent_spec.to(leaf.device or latent_spec.device)
+        # In this order: a group that were empty for a moment would lose its batch size.
+        set_leaf(action_spec, self.latent_key, latent_spec, self.parent)
+        return (
+            action_spec
+            if self.latent_key == self.action_key
+            else _without(action_spec, self.action_key)
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        set_leaf(observation_spec, self.executed_key, self._executed_leaf.clone(), self.parent)
+        return observation_spec
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({type(self.module).__name__}, {self._keys()})"
+
+    def _keys(self) -> str:
+        names = ("latent_key", "action_key", "executed_key", "decoded_key")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        _refuse_replay_buffer(type(self).__name__)
+        super().set_container(container)
+        if self.parent is None:  # a Compose that is not in an env yet
+            return
+        try:
+            self._check_env(self.parent)
+        except ValueError:
+            self.reset_parent()
+            raise
+
+    def train(self, mode: bool = True) -> LatentAction:
+        # A ready-made Compose passed to a buffer is not re-attached, but it is put in eval mode.
+        _refuse_replay_buffer(type(self).__name__)
+        return super().train(mode)
+
+    def _check_env(self, env: EnvBase) -> None:
+        name, actions = type(self).__name__, env.full_action_spec
+        if self.action_key not in actions.keys(True, True):
+            raise ValueError(
+                f"{name} decodes into {self.action_key!r}, but the env's action keys are "
+                f"{env.action_keys}; pass one of them as action_key."
+            )
+        observations = env.full_observation_spec.keys(True, True)
+        for key in (self.latent_key, self.executed_key):
+            if key in observations:
+                raise ValueError(
+                    f"{key!r} is an observation of the env already; give {name} another key for it."
+                )
+        if isinstance(env.base_env, TransformedEnv) and self.action_key in (
+            unravel_key(key) for key in env.base_env.transform.in_keys_inv or ()
+        ):
+            warnings.warn(
+                f"The transforms of an inner environment rewrite {self.action_key!r} out of the "
+                f"sight of {name}, so that {self.executed_key!r} is not what the simulator "
+                f"executes; append {name} to that environment instead.",
+                stacklevel=2,
+            )
+        self._check_action(actions[self.action_key])
+
+    def _check_action(self, leaf: TensorSpec) -> None:
+        weights = [*self.module.parameters(), *self.module.buffers()]
+        latent = self.latent_spec.zero()
+        shape = self.decode(latent.to(weights[0].device) if weights else latent).shape
+        if shape != leaf.shape[-1:]:
+            raise ValueError(
+                f"The module makes actions of shape {list(shape)} but the env's "
+                f"{self.action_key!r} has {list(leaf.shape[-1:])}; use a module made for this env."
+            )
+
+
+def _without(spec: Composite, key: NestedKey) -> Composite:
+    """``spec`` less one leaf, and less the nodes that it leaves empty."""
+    del spec[key]
+    while not isinstance(key, str) and spec[key[:-1]].is_empty():
+        key = unravel_key(key[:-1])
+        del spec[key]
+    return spec
+
+
+def _beside(key: NestedKey, name: str) -> NestedKey:
+    return name if isinstance(key, str) else unravel_key((*key[:-1], name))
+
+
+def _refuse_replay_buffer(name: str) -> None:
+    # A buffer tells its transforms nothing: it puts them in a Compose without an env, which is
+    # also what every env pipeline is before it is attached. The caller is the only difference.
+    frame = sys._getframe(1)
+    while frame is not None:
+        # ``issubclass``, because TorchRL's ``isinstance`` hook queries attributes of its argument
+        # and half-built envs among the callers do not survive that.
+        if issubclass(type(frame.f_locals.get("self")), ReplayBuffer):
+            raise TypeError(
+                f"{name} cannot be attached to a replay buffer, because buffers call the "
+                "inverse of their transforms on extend and recorded actions would be overwritten; "
+                "attach it to the env."
+            )
+        frame = frame.f_back
