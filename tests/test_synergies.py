@@ -20,7 +20,7 @@ from torchrl_etl.synergies import (
     save_bundle,
 )
 
-AFFINE = ("pca", "nmf")
+AFFINE = ("pca", "nmf", "sar")
 FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden": (8,)}}
 
 
@@ -101,6 +101,40 @@ def test_nmf_decodes_with_the_slope_of_its_factors_in_the_middle_of_the_box() ->
     torch.testing.assert_close(decoder.module(at), ends.mean(0) @ model.basis)
     slope = torch.autograd.functional.jacobian(decoder.module, at)
     torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
+
+
+def test_sar_finds_sources_that_are_independent_with_unit_variance() -> None:
+    """Two sources of ±1 in every combination equally often; what mixes them is found."""
+    signs = torch.cartesian_prod(torch.tensor([-1.0, 1.0]), torch.tensor([-1.0, 1.0])).repeat(50, 1)
+    mixing = torch.tensor([[0.3, 0.1, 0.0], [0.1, -0.3, 0.2]])
+    middle = torch.tensor([0.1, 0.2, 0.3])
+    model = fit_synergies(middle + signs @ mixing, "sar", 2)
+    torch.testing.assert_close(model.mean, middle)
+    found = model.basis[model.basis[:, 2].abs().argsort()]  # either order, either sign
+    torch.testing.assert_close(found.abs(), mixing.abs(), atol=1e-3, rtol=0)
+    coefficients = model.coefficients(middle + signs @ mixing)
+    torch.testing.assert_close(
+        coefficients.mT @ coefficients / 200, torch.eye(2), atol=1e-3, rtol=0
+    )
+
+
+def test_sar_decodes_with_the_slope_of_its_components_in_the_middle_of_the_box() -> None:
+    actions = activity()
+    model = fitted("sar", actions)
+    decoder = model.decoder(actions)
+    ends = model.coefficients(actions).quantile(torch.tensor([0.01, 0.99]), dim=0)
+    at = torch.zeros(2)
+    torch.testing.assert_close(decoder.module(at), model.mean + ends.mean(0) @ model.basis)
+    slope = torch.autograd.functional.jacobian(decoder.module, at)
+    torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
+
+
+def test_sar_leaves_components_without_variance_as_they_are() -> None:
+    """One source of three muscles: of three components one varies."""
+    actions = torch.rand(200, 1) @ torch.tensor([[0.5, 0.3, 0.1]])
+    model = fit_synergies(actions, "sar", 3, low=0.0, high=1.0)
+    torch.testing.assert_close(model.basis @ model.basis.mT, torch.eye(3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(model.reconstruct(actions), actions, atol=1e-5, rtol=0)
 
 
 def test_a_muscle_that_rests_stays_at_rest_in_nmf() -> None:
@@ -186,9 +220,10 @@ def test_both_stages_run_with_every_kind(kind: str, tmp_path) -> None:
     run = tmp_path / "run"
     pictures = f"pictures={str(kind in AFFINE).lower()}"
     settings = (f"synergies={kind}", "vaf_curve.dims=[1]", "learn.prefill=true")
+    settings += ("explore.frames=192", "learn.frames=64", "evaluation.episodes=1")
     experiment = Experiment(tiny(f"run_dir='{run}'", *settings, pictures))
     summary = experiment.run()
-    assert summary["learn"]["frames"] == 1208 - 600
+    assert summary["learn"]["frames"] == 64
     assert load_bundle(run)[0].num_synergies == 2
 
 

@@ -11,9 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_positive
-from torchrl_etl.extras import extra
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.modules.synergy_decoder import SynergyMap
+from torchrl_etl.synergies.sar import independent_components
 
 __all__ = ["SARDecoder", "best_episodes"]
 
@@ -149,21 +149,11 @@ class SARDecoder(SynergyMap):
         """
         _check_blend(blend)
         _check_actions(actions, num_synergies, low, high)
-        # Takes a second to import, which a worker that only decodes should not spend.
-        with extra("rivals"):
-            from sklearn.decomposition import PCA, FastICA
-            from sklearn.pipeline import make_pipeline
-            from sklearn.preprocessing import MinMaxScaler
-
-        chain = make_pipeline(
-            PCA(num_synergies, random_state=seed),
-            FastICA(whiten="unit-variance", max_iter=1000, random_state=seed),
-            MinMaxScaler((-1, 1)),
-        )
-        chain.fit(actions.detach().cpu().double().numpy())
-        corners = torch.cat([torch.zeros(1, num_synergies), torch.eye(num_synergies)])
-        mean, *ends = torch.as_tensor(chain.inverse_transform(corners.double().numpy()))
-        basis = torch.stack(ends) - mean
+        rows = actions.detach().cpu().double().numpy()
+        mean, basis = map(torch.as_tensor, independent_components(rows, num_synergies, seed=seed))
+        coefficients = (torch.as_tensor(rows) - mean) @ basis.pinverse()
+        least, most = coefficients.aminmax(dim=0)
+        mean, basis = mean + (least + most) / 2 @ basis, ((most - least) / 2)[:, None] * basis
         return cls(mean.to(actions), basis.to(actions), low=low, high=high, blend=blend, **keys)
 
     def log_slope(self, synergy: Tensor) -> Tensor:

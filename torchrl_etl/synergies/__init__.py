@@ -8,6 +8,7 @@ from torchrl_etl.synergies.model import SynergyModel
 from torchrl_etl.synergies.nmf import NMFSynergies
 from torchrl_etl.synergies.pca import PCASynergies
 from torchrl_etl.synergies.recordings import Recording, read_recording
+from torchrl_etl.synergies.sar import SARSynergies
 from torchrl_etl.synergies.shown import ShownActions
 from torchrl_etl.synergies.vae import VAESynergies
 
@@ -18,6 +19,7 @@ __all__ = [
     "NMFSynergies",
     "PCASynergies",
     "Recording",
+    "SARSynergies",
     "ShownActions",
     "SynergyModel",
     "VAESynergies",

@@ -14,12 +14,14 @@ from torchrl_etl.synergies.gmvae import GMVAESynergies
 from torchrl_etl.synergies.model import SynergyModel
 from torchrl_etl.synergies.nmf import NMFSynergies
 from torchrl_etl.synergies.pca import PCASynergies
+from torchrl_etl.synergies.sar import SARSynergies
 from torchrl_etl.synergies.vae import VAESynergies
 
 __all__ = ["SYNERGY_MODELS", "fit_synergies"]
 
 SYNERGY_MODELS: Mapping[str, type[SynergyModel]] = {
-    model.kind: model for model in (GMVAESynergies, VAESynergies, PCASynergies, NMFSynergies)
+    model.kind: model
+    for model in (GMVAESynergies, VAESynergies, PCASynergies, NMFSynergies, SARSynergies)
 }
 """Kinds of synergies by name; ``"my_module:MySynergies"`` names one's own."""
 
@@ -37,7 +39,7 @@ def fit_synergies(
 
     Args:
         actions (array): [N, n] between the bounds: a tensor, a NumPy array or lists.
-        kind (str or type): ``"gmvae"``, ``"vae"``, ``"pca"`` or ``"nmf"``, see
+        kind (str or type): ``"gmvae"``, ``"vae"``, ``"pca"``, ``"nmf"`` or ``"sar"``, see
             :data:`~torchrl_etl.synergies.SYNERGY_MODELS`; a model of one's own is its class, or
             ``"my_module:MySynergies"``.
         num_synergies (int): d, at most n.
