@@ -2,6 +2,7 @@
 
     python recipes/etl_sac.py env=myoHandPenTwirl experiment=quick
     python recipes/etl_sac.py env=myoHandKeyTurn stage=learn synergies=runs/NAME
+    python recipes/etl_sac.py env=myoHandPenTwirl seeds=[0,1,2] 'run_dir=runs/pen-${seed}'
     python recipes/etl_sac.py resume=runs/NAME
 
 Settings are given as key=value, nested ones with a dot: learn.sac.lr=1e-3. A run leaves its

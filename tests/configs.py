@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -46,8 +48,18 @@ RESIDUAL = (
 def tiny(*overrides: str, name: str = "config", conf: Path = CONF) -> DictConfig:
     """The tiny configuration with overrides, of those settings that the chosen kinds have."""
     small = [setting for setting in TINY if _is_there(setting, overrides, conf)]
+    given = [override for override in overrides if not override.startswith("run_dir=")]
+    config = deepcopy(_composed(conf, name, *translate([*small, *given], conf)))
+    for override in overrides:
+        if override.startswith("run_dir="):
+            config.run_dir = override.removeprefix("run_dir=").strip("'")
+    return config
+
+
+@cache  # composing takes a quarter of a second
+def _composed(conf: Path, name: str, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(conf), version_base="1.3"):
-        return compose(name, overrides=translate([*small, *overrides], conf))
+        return compose(name, overrides=[*overrides])
 
 
 def _is_there(setting: str, overrides: Sequence[str], conf: Path) -> bool:

@@ -8,10 +8,14 @@ import torch
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners.side_by_side import stacked
 
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1)
 MAKERS = {
-    "sac": lambda *settings: method_stage("sac", *settings),
+    **{
+        name: lambda *settings, name=name: method_stage(name, *settings)
+        for name in ("sac", "lattice", "dynsyn", "eme")
+    },
     "stage 2": lambda *settings: learn_stage(None, *settings),
     "stage 2, categorical": lambda *settings: learn_stage(
         None, *RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]", *settings
@@ -21,24 +25,28 @@ MAKERS = {
 }
 
 
-@pytest.fixture
-def still(monkeypatch):
-    """Noise is zero and pairs are not shuffled, so that numbers can be compared one by one."""
-    monkeypatch.setattr(torch, "randn_like", torch.zeros_like)
-    monkeypatch.setattr(torch, "randperm", lambda n, **options: torch.arange(n))
+def draws(group, batches):
+    """The random numbers of each learner, of a generator that was seeded with its seed."""
+    drawn = []
+    for seed, batch in zip(SEEDS, batches, strict=True):
+        torch.manual_seed(seed)
+        drawn.append(group.draw(batch))
+    return drawn
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-def test_gradients_of_stacked_learners_are_those_of_each(make, still):
+def test_gradients_of_stacked_learners_are_those_of_each(make):
     stages = [make(f"seed={seed}") for seed in SEEDS]
     for stage in stages:
         fill(stage)
         stage.close()
-    batches = [stage.buffer.sample() for stage in stages]
-    alone = [stage.learner.gradients(batch) for stage, batch in zip(stages, batches, strict=True)]
-    together, scalars = SideBySide([stage.learner for stage in stages]).gradients(
-        torch.stack(batches)
-    )
+    batches = [stage.sample() for stage in stages]
+    alone = []
+    for seed, stage, batch in zip(SEEDS, stages, batches, strict=True):
+        torch.manual_seed(seed)
+        alone.append(stage.learner.gradients(batch))
+    group = SideBySide([stage.learner for stage in stages])
+    together, scalars = group.gradients(stacked(batches, draws(group, batches)))
     for (expected, logged), found, log in zip(alone, together, scalars.unbind(0), strict=True):
         assert len(found) == len(expected)
         for one, other in zip(expected, found, strict=True):
@@ -49,7 +57,7 @@ def test_gradients_of_stacked_learners_are_those_of_each(make, still):
             torch.testing.assert_close(log[key], value, rtol=1e-3, atol=1e-5)
 
 
-def test_an_update_moves_each_learner_by_its_own_batch(still):
+def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
     ours = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
     theirs = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
     for one, other in zip(ours, theirs, strict=True):
@@ -59,11 +67,12 @@ def test_an_update_moves_each_learner_by_its_own_batch(still):
     for stage in (*ours, *theirs):  # Adam's first steps make a sign of rounding
         stage.learner.optimizer = torch.optim.SGD(stage.learner.parameters, lr=1e-2)
     starts = [snapshot(stage.learner.ema) for stage in theirs]
-    side_by_side = SideBySide([stage.learner for stage in ours])
+    group = SideBySide([stage.learner for stage in ours])
     for _ in range(3):
-        batches = [stage.buffer.sample() for stage in ours]
-        side_by_side.update(batches)
-        for stage, batch in zip(theirs, batches, strict=True):
+        batches = [stage.sample() for stage in ours]
+        group.update(batches, draws(group, batches))
+        for seed, stage, batch in zip(SEEDS, theirs, batches, strict=True):
+            torch.manual_seed(seed)
             stage.learner.update(batch)
     for one, other, start in zip(ours, theirs, starts, strict=True):
         moved = apart = 0.0
@@ -74,18 +83,16 @@ def test_an_update_moves_each_learner_by_its_own_batch(still):
         one.close(), other.close()
 
 
-def test_noise_differs_from_learner_to_learner():
-    stages = [learn_stage(None, "seed=0") for _ in range(2)]
-    fill(stages[0])
-    batch = stages[0].buffer.sample()
-    state = stages[0].learner.objective.state_dict()
-    stages[1].learner.objective.load_state_dict(state)
-    _, scalars = SideBySide([stage.learner for stage in stages]).gradients(
-        torch.stack([batch, batch])
-    )
-    assert scalars["loss_actor"][0] != scalars["loss_actor"][1]
-    for stage in stages:
-        stage.close()
+def test_finding_out_what_is_drawn_draws_nothing():
+    stage = learn_stage()
+    fill(stage)
+    batch, group = stage.sample(), SideBySide([stage.learner])
+    torch.manual_seed(0)
+    first = group.draw(batch)
+    torch.manual_seed(0)
+    second = group.draw(batch)
+    assert first and all(torch.equal(one, two) for one, two in zip(first, second, strict=True))
+    stage.close()
 
 
 def test_learners_of_other_sizes_are_refused():

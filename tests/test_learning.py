@@ -36,7 +36,7 @@ def test_stage_1_finds_actions_in_the_subspace_that_moves_the_joints(basis):
     stage.restart_collection()
     while not stage.finished:
         stage.collect()
-        stage.learn()
+        alone(stage.learn())
     stage.close()
     actions = explorer.actions(1500)
     deviation = actions - actions.mean(0)
@@ -71,6 +71,6 @@ def test_stage_2_solves_the_task_in_the_known_synergies(basis):
     stage.restart_collection()
     while not stage.finished:
         stage.collect()
-        stage.learn()
+        alone(stage.learn())
     stage.close()
     assert evaluate().solved.mean >= 0.8

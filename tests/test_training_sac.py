@@ -241,7 +241,7 @@ def test_learning_rates_fall_in_a_line_with_the_frames():
     initial = [group["lr"] for group in stage.learner.optimizer.param_groups]
     while not stage.finished:
         stage.collect()
-        stage.learn()
+        alone(stage.learn())
         share = 1 - 0.5 * stage.frames / 640
         rates = [group["lr"] for group in stage.learner.optimizer.param_groups]
         assert rates == pytest.approx([share * lr for lr in initial])

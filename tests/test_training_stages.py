@@ -225,7 +225,7 @@ def test_updates_keep_the_ratio_that_was_asked_for():
     stage = found.stage
     for _ in range(5):
         stage.collect()
-        stage.learn()
+        alone(stage.learn())
     assert stage.progress.frames == 160
     assert stage.progress.updates == 16
     stage.close()
@@ -244,7 +244,7 @@ def test_frames_are_steps_of_the_simulator_however_long_an_action_lasts(tmp_path
     )
     stage = Explorer(run.context).stage
     stage.restart_collection()
-    stage.collect(), stage.learn()  # 32 actions
+    stage.collect(), alone(stage.learn())  # 32 actions
     assert stage.frames == 64 and len(stage.buffer) == 32 and stage.progress.updates == 16
     stage.close()
     summary = run.run()

@@ -22,6 +22,7 @@ from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder, facts
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work, alone
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -70,6 +71,16 @@ class Experiment:
 
     def run(self) -> dict[str, Any]:
         """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
+        with StopOnSignal() as stop:
+            return alone(self.work(stop))
+
+    def work(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
+        """The same as work that pauses at each update, see
+        :func:`~torchrl_etl.training.together`.
+
+        Args:
+            stop (StopOnSignal): asked after every batch.
+        """
         self.folder.open(resume=self.resume)
         self.context.say(f"Run folder: {self.folder.path}")
         if self.config.threads:
@@ -79,10 +90,10 @@ class Experiment:
             "goal": self.task.goal,
             "seed": self.config.seed,
         }
-        with StopOnSignal() as stop, closing(self.folder):
-            summary |= self.method.prepare(stop)
+        with closing(self.folder):
+            summary |= yield from self.method.prepare(stop)
             if self.config.stage != "explore":
-                summary["learn"] = self._learn(stop)
+                summary["learn"] = yield from self._learn(stop)
             self.folder.write_json("summary.json", {**summary, "versions": facts()})
         return summary
 
@@ -115,11 +126,11 @@ class Experiment:
             action_repeat=self.config.action_repeat,
         )
 
-    def _learn(self, stop: StopOnSignal) -> dict[str, Any]:
+    def _learn(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         stage, charged = self.method.stage(), self.method.charged
         self.method.begin(stage)
         evaluator = self.evaluator(stage)
-        last = self.context.run_stage(
+        last = yield from self.context.run_stage(
             stage,
             stop,
             evaluate=evaluator,

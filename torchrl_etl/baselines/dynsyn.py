@@ -13,7 +13,9 @@ from torch import distributions as D
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 
+from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers, start_small
+from torchrl_etl.objectives.sac import drawn
 
 __all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
 
@@ -127,8 +129,8 @@ class GroupedTanhNormal(D.Distribution):
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
         """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too."""
-        shared, log_prob = self.group_normal.rsample_and_log_prob(torch.Size(sample_shape))
-        noise = torch.randn_like(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
+        shared, log_prob = drawn(self.group_normal, sample_shape)
+        noise = standard_normal(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
         return self._spread(shared, self.weight_loc + self.weight_scale * noise), log_prob
 
     def log_prob(self, value: Tensor) -> Tensor:

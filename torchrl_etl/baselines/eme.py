@@ -22,6 +22,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_positive
+from torchrl_etl.draws import standard_uniform
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 
@@ -323,7 +324,7 @@ class EMELoss(LossModule):
         distance = functional.l2_distance(embedding, embedding[partner])
         error = (predictions - reward.unsqueeze(-1)).square()
         if self.subset_share < 1.0:
-            drawn = torch.rand_like(error) < self.subset_share
+            drawn = standard_uniform(error) < self.subset_share
             error = error * drawn / self.subset_share
         out = {
             "loss_metric": distance_loss(distance, target, self.loss_function),

@@ -14,6 +14,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
+from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers
 
 __all__ = [
@@ -79,7 +80,7 @@ class LatticeNormal(D.TransformedDistribution):
         """
         gaussian = self.base_dist
         loc, scale_tril = gaussian.loc, gaussian.scale_tril
-        noise = torch.randn(*sample_shape, *loc.shape, dtype=loc.dtype, device=loc.device)
+        noise = standard_normal(loc.expand(*sample_shape, *loc.shape))
         value = loc + (scale_tril @ noise.unsqueeze(-1)).squeeze(-1)
         log_scale = scale_tril.diagonal(dim1=-2, dim2=-1).log()
         log_prob = -(noise.square() / 2 + math.log(2 * math.pi) / 2 + log_scale).sum(-1)

@@ -154,6 +154,7 @@ class SACLearner:
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self.compile = compile
         self._gradients = compiled(self.gradients) if compile else self.gradients
         graphed = compile and self.device.type == "cuda"
         self._step = cuda_graph(self.step) if graphed else self.step

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.draws import Draw, given_draws, recorded_draws
+from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.sac import SACLearner
 
 __all__ = ["SideBySide"]
@@ -20,14 +20,11 @@ class SideBySide:
 
     The objective is that of the first learner, under :func:`torch.vmap` over the stacked parameters
     and buffers of all: there is no second set of equations. Optimizers, targets and EMAs stay those
-    of the learners.
+    of the learners; the pass is compiled if theirs are.
 
     Args:
         learners (sequence of SACLearner): of equal sizes and settings; their bounds, statistics and
             weights may differ.
-
-    Keyword Args:
-        compile (bool): compile the pass. Default: ``False``.
 
     Raises:
         ValueError: if there is no learner, or one has parameters of other shapes.
@@ -47,12 +44,14 @@ class SideBySide:
         >>> entries = {"observation": torch.randn(4, 3), "action": torch.zeros(4, 2)}
         >>> entries["next"] = {"observation": torch.randn(4, 3), **ends}
         >>> batches = [TensorDict(entries, [4]) for _ in range(2)]
-        >>> logs = SideBySide([learner(), learner()]).update(batches)
+        >>> group = SideBySide([learner(), learner()])
+        >>> draws = [group.draw(batch) for batch in batches]
+        >>> logs = group.update(batches, draws)
         >>> [log["loss_qvalue"].shape for log in logs]
         [torch.Size([]), torch.Size([])]
     """
 
-    def __init__(self, learners: Sequence[SACLearner], *, compile: bool = False) -> None:
+    def __init__(self, learners: Sequence[SACLearner]) -> None:
         if not learners:
             raise ValueError("learners is empty; give at least one.")
         shapes = [[parameter.shape for parameter in of.parameters] for of in learners]
@@ -62,35 +61,77 @@ class SideBySide:
                 "updated side by side only where observations, actions and networks agree."
             )
         self.learners = list(learners)
-        self._gradients = compiled(self.gradients) if compile else self.gradients
+        self._draws: list[Draw] | None = None
+        first = learners[0]
+        self._gradients = compiled(self.gradients) if first.compile else self.gradients
+        graphed = first.compile and first.device.type == "cuda"
+        self._step = cuda_graph(self.step) if graphed else self.step
 
-    def update(self, batches: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-        """One update of every learner, each on its own batch [B]; returns their scalars."""
-        gradients, scalars = self._gradients(torch.stack(list(batches)))
-        for learner, own in zip(self.learners, gradients, strict=True):
-            learner.descend(own)
+    def draw(self, batch: TensorDictBase) -> list[Tensor]:
+        """The random numbers of one learner's update, from the generators as they are.
+
+        Args:
+            batch (TensorDictBase): any batch [B] of such updates; it tells what is drawn.
+        """
+        if self._draws is None:
+            random = GlobalRNGState().state_dict()
+            with recorded_draws() as self._draws, torch.no_grad():
+                self.learners[0].objective(batch)
+            GlobalRNGState().load_state_dict(random)
+        return [draw() for draw in self._draws]
+
+    def update(
+        self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]
+    ) -> list[TensorDictBase]:
+        """One update of every learner, each on its own batch [B] and with its own random numbers.
+
+        Returns:
+            list of TensorDictBase: the scalars of each.
+        """
+        scalars = self._step(stacked(batches, draws))
+        for learner in self.learners:
             learner.ema.update_parameters(learner.actor)
         return list(scalars.unbind(0))
 
+    def step(self, inputs: TensorDictBase) -> TensorDictBase:
+        """Everything of an update that runs on the device; returns scalars [seeds]."""
+        gradients, scalars = self._gradients(inputs)
+        for learner, own in zip(self.learners, gradients, strict=True):
+            learner.descend(own)
+        return scalars
+
     def gradients(
-        self, batches: TensorDictBase
+        self, inputs: TensorDictBase
     ) -> tuple[list[tuple[Tensor | None, ...]], TensorDictBase]:
         """Each learner's gradients in the order of its ``parameters``, and scalars [seeds].
 
         Args:
-            batches (TensorDictBase): of shape [seeds, B].
+            inputs (TensorDictBase): of shape [seeds]: ``batch`` [seeds, B], and under ``draws`` the
+                random numbers in the order in which they are drawn.
         """
         objectives = [learner.objective for learner in self.learners]
         # Stacked anew each time: gradients then flow back to the learners' own parameters.
         stacked = torch.stack([TensorDict.from_module(each) for each in objectives])
-        first = objectives[0]
+        first, draws = objectives[0], inputs["draws"]
+        order = [draws[f"{i}"] for i in range(len(draws.keys()))]
 
-        def objective(params: TensorDictBase, batch: TensorDictBase) -> tuple[Tensor, Any]:
-            with params.to_module(first):
+        def objective(
+            params: TensorDictBase, batch: TensorDictBase, given: list[Tensor]
+        ) -> tuple[Tensor, TensorDictBase]:
+            with params.to_module(first), given_draws(given):
                 return first(batch)
 
-        losses, scalars = torch.vmap(objective, (0, 0), randomness="different")(stacked, batches)
+        losses, scalars = torch.vmap(objective)(stacked, inputs["batch"], order)
         parameters = [p for learner in self.learners for p in learner.parameters]
         flat = torch.autograd.grad(losses.sum(), parameters, allow_unused=True)
         count = len(self.learners[0].parameters)
         return [flat[i : i + count] for i in range(0, len(flat), count)], scalars.detach()
+
+
+def stacked(
+    batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]
+) -> TensorDictBase:
+    """Batches [B] and random numbers of several learners, as :class:`SideBySide` reads them."""
+    given = {f"{i}": torch.stack(each) for i, each in enumerate(zip(*draws, strict=True))}
+    size = [len(batches)]
+    return TensorDict({"batch": torch.stack(list(batches)), "draws": TensorDict(given, size)}, size)

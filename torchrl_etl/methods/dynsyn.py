@@ -21,6 +21,7 @@ from torchrl_etl.methods.method import Method
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work
 
 __all__ = ["DynSyn"]
 
@@ -47,7 +48,8 @@ class DynSyn(Method):
         self.share = self.of_the_body(options.pop("group_share"))
         self.actor_options = options
 
-    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+    def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
+        yield from super().prepare(stop)
         if not self.file.is_file():
             seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
             lengths = record_muscle_lengths(

@@ -29,6 +29,7 @@ from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work
 
 __all__ = ["ETL", "FineTuning"]
 
@@ -123,21 +124,21 @@ class ETL(Method):
             )
         return Path(given)
 
-    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+    def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         if self.given:  # a run holds all it needs, wherever it is moved
             copy_bundle(self.bundle, self.context.folder.synergies)
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
-            self._explore(stop)
+            yield from self._explore(stop)
         _, info = self.decoder()
         if not self.given:  # whole batches were collected, a few frames more than the budget
             self.charged = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
 
-    def _explore(self, stop: StopOnSignal) -> None:
+    def _explore(self, stop: StopOnSignal) -> Work[None]:
         """Explore and leave a bundle in the run folder; that it is there says that this is done."""
         context, explorer = self.context, Explorer(self.context)
         stage = explorer.stage
-        context.run_stage(stage, stop)
+        yield from context.run_stage(stage, stop)
         decoder = explorer.condense(stop.check)
         numbers, warnings = describe_synergies(explorer.model, decoder, explorer.actions())
         if (embedded := explorer.exploration.embed(stage.newest(20_000)["next"])) is not None:

@@ -9,6 +9,7 @@ from torchrl_etl.envs import has_free_root
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work
 
 __all__ = ["Method"]
 
@@ -50,7 +51,7 @@ class Method:
                 "synergies out."
             )
 
-    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+    def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         """Find out what :meth:`stage` needs and leave it in the run folder.
 
         What is there already is not done again.
@@ -58,6 +59,7 @@ class Method:
         Returns:
             dict: facts for ``summary.json``.
         """
+        yield from ()
         return {}
 
     def stage(self) -> Stage:

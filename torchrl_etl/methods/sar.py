@@ -21,6 +21,7 @@ from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work
 
 __all__ = ["SAR"]
 
@@ -68,10 +69,10 @@ class SAR(Method):
     def file(self) -> Path:
         return self.context.folder.path / "sar.safetensors"
 
-    def prepare(self, stop: StopOnSignal) -> dict[str, Any]:
+    def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         if not self.file.is_file():
             play = self.play_stage()
-            self.context.run_stage(play, stop)
+            yield from self.context.run_stage(play, stop)
             decoder = self.fit(self.best(rollouts(play, self.rollout_frames, stop.check)))
             write_atomically(self.file, save(decoder.state_dict()))
         return {}

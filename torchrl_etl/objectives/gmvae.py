@@ -13,6 +13,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice
+from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules import GMVAE
 from torchrl_etl.objectives.checks import check_parts
 
@@ -119,7 +120,7 @@ class GMVAELoss(LossModule):
         with self.gmvae_params.to_module(gmvae, preserve_module_state=False):
             posterior = gmvae.encode(action)
             # Drawn by hand: inside a loss TorchRL turns every distribution's sample into its mode.
-            latent = posterior.loc + posterior.scale * torch.randn_like(posterior.loc)
+            latent = posterior.loc + posterior.scale * standard_normal(posterior.loc)
             terms = functional.gmvae_bound(
                 gmvae.normalize(action),
                 gmvae.decoder.unit(latent),

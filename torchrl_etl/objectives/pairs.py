@@ -9,6 +9,8 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_etl.draws import uniform_order
+
 __all__ = ["outputs", "partners"]
 
 
@@ -29,7 +31,7 @@ def partners(
         index = torch.arange(samples, device=device)
         return (index.unsqueeze(1) + index[1:]) % samples
     # Neighbors on a random circle: a random permutation that maps no sample to itself.
-    order = torch.randperm(samples, device=device)
+    order = uniform_order(samples, device)
     return torch.empty_like(order).scatter_(0, order, order.roll(1)).unsqueeze(1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,6 +19,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl.checks import check_choice
+from torchrl_etl.draws import standard_normal
 from torchrl_etl.functional import (
     categorical_cross_entropy,
     categorical_mean,
@@ -240,16 +242,17 @@ def _check_support(support: Tensor) -> None:
         )
 
 
-def drawn(distribution: Distribution) -> tuple[Tensor, Tensor]:
-    """A reparametrized sample [*, n] and its log-probability [*], under ``torch.vmap`` too.
+def drawn(
+    distribution: Distribution, sample_shape: Sequence[int] = ()
+) -> tuple[Tensor, Tensor]:
+    """Reparametrized samples [S, *, n] with their log-probabilities [S, *].
 
-    ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses;
-    :func:`torch.randn_like` draws the same numbers.
+    ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses.
     """
     if not isinstance(distribution, TanhNormal):
         return compute_rsample_log_prob(distribution)
     loc, scale = distribution.loc, distribution.scale
-    preimage = loc + scale * torch.randn_like(loc)
+    preimage = loc + scale * standard_normal(loc.expand(*sample_shape, *loc.shape))
     transform = distribution.transforms[0]
     action = transform(preimage)
     slope = transform.log_abs_det_jacobian(preimage, action)

@@ -17,9 +17,11 @@ from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.extras import extra
 from torchrl_etl.learners import SACLearner, build_learner
+from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage, frames_per_action
+from torchrl_etl.training.work import Work
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -153,7 +155,9 @@ class Context:
         """Actions of each worker, all its simulators counted, in so many frames of the run."""
         return frames // frames_per_action(self.options("collector"), self.config.action_repeat)
 
-    def run_stage(self, stage: Stage, stop: StopOnSignal, **options: Any) -> Any:
+    def run_stage(
+        self, stage: Stage, stop: StopOnSignal, **options: Any
+    ) -> Work[Evaluation | None]:
         """Run a stage to its end, see :func:`~torchrl_etl.training.loop.run_stage`."""
         configured = {
             "checkpoint_every": self.config.checkpoint.every,

@@ -18,6 +18,7 @@ from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.work import Work
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -82,7 +83,7 @@ def run_stage(
     log_every: int,
     offset: int = 0,
     show_progress: bool = True,
-) -> Evaluation | None:
+) -> Work[Evaluation | None]:
     """Run a stage to the end of its budget, going on from its newest whole checkpoint.
 
     Every checkpoint starts new episodes (see :meth:`Stage.restart_collection`), so a run that was
@@ -133,9 +134,9 @@ def run_stage(
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames
-            report.batch(stage.collect(), stage.learn())
+            report.batch(stage.collect(), (yield from stage.learn()))
             while stage.behind and not stop.requested:
-                stage.learn()
+                yield from stage.learn()
             if _passed(before, stage.frames, log_every) or stage.finished:
                 report.write()
             if evaluate is not None and (

@@ -26,6 +26,7 @@ from torchrl_etl.io import reserve
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
+from torchrl_etl.training.work import Due, Work
 
 __all__ = ["Progress", "Stage"]
 
@@ -123,7 +124,7 @@ class Stage:
         self.name, self.learner, self.seed, self.device = name, learner, seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
         self.restart_seed = restart_seed
-        self._update = learner.update if update is None else update
+        self._update = update
         self.replay_ratio, self.learning_starts = replay_ratio, learning_starts
         self.progress = Progress()
         self.batches: Batches | None = None
@@ -173,7 +174,7 @@ class Stage:
             self.earn(batch.numel())
         return batch.reshape(-1)
 
-    def learn(self) -> TensorDictBase | None:
+    def learn(self) -> Work[TensorDictBase | None]:
         """The updates that the collected frames have earned; returns their mean scalars.
 
         The thousands that a prefilled buffer has earned are made up for in parts, see
@@ -182,13 +183,23 @@ class Stage:
         due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
         self.progress.updates += due
-        logs = [self.update() for _ in range(due)]
+        logs = []
+        for _ in range(due):
+            batch = self.sample()
+            if self._update is None:
+                logs.append((yield Due(self.name, self.learner, batch)))
+            else:
+                logs.append(self._update(batch))
         self.learner.advance(self.frames, self.frames / self.budget)
         return torch.stack(logs).mean(0) if logs else None
 
+    def sample(self) -> TensorDictBase:
+        """A batch [B] out of the buffer."""
+        return self.buffer.sample().to(self.device)
+
     def update(self) -> TensorDictBase:
         """One update on a sampled batch; returns scalars to log."""
-        return self._update(self.buffer.sample().to(self.device))
+        return (self._update or self.learner.update)(self.sample())
 
     def earn(self, transitions: int) -> None:
         """Owe the updates that the frames of so many transitions are worth."""

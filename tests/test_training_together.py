@@ -1,0 +1,85 @@
+"""Runs of several seeds in one process are the runs that each seed would have been by itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+from tests.configs import tiny
+from tests.runs import numbers
+from torchrl_etl.draws import given_draws
+from torchrl_etl.envs import SimulationError
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.learners import SideBySide
+from torchrl_etl.training import Interrupted, alone, resumed_config, together
+from torchrl_etl.training.context import stage_seed
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.stage import Stage
+
+SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")
+
+
+def work(run: Path, seed: int, *settings: str, stop: StopOnSignal | None = None):
+    config = tiny(f"run_dir='{run}'", f"seed={seed}", *SHORT, *settings)
+    return Experiment(config).work(stop or StopOnSignal())
+
+
+def one_after_another(group: SideBySide, batches, draws) -> list:
+    """The same updates with the same random numbers, each by itself: without rounding otherwise."""
+    scalars = []
+    for learner, batch, given in zip(group.learners, batches, draws, strict=True):
+        with given_draws(given):
+            scalars.append(learner.update(batch))
+    return scalars
+
+
+def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(SideBySide, "update", one_after_another)
+    summaries = together([work(tmp_path / f"{seed}", seed) for seed in (0, 1)])
+    for seed, summary in enumerate(summaries):
+        assert summary["seed"] == seed and summary["learn"]["frames_charged"] >= 416
+        alone(work(tmp_path / f"alone{seed}", seed))
+        assert numbers(tmp_path / f"{seed}") == numbers(tmp_path / f"alone{seed}")
+
+
+def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
+    ends = together([work(tmp_path / f"{seed}", seed, "method=sac") for seed in (0, 1)])
+    assert ends[0]["learn"]["return"] != ends[1]["learn"]["return"]
+    for run in (tmp_path / "0", tmp_path / "1"):
+        stage = Experiment(resumed_config(run), resume=run).learned()
+        assert all(value.isfinite().all() for value in stage.learner.policy.parameters())
+
+
+def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
+    collect = Stage.collect
+
+    def diverge(stage):
+        if stage.seed == stage_seed(1, "learn") and stage.frames > 200:
+            raise SimulationError("it diverged")
+        return collect(stage)
+
+    monkeypatch.setattr(Stage, "collect", diverge)
+    ends = together([work(tmp_path / f"{seed}", seed, "method=sac") for seed in (0, 1)])
+    assert ends[0]["learn"]["frames"] == 416
+    assert isinstance(ends[1], SimulationError)
+    assert not (tmp_path / "1" / "summary.json").exists()
+
+
+def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypatch):
+    collect = Stage.collect
+
+    def collect_and_signal(stage):
+        batch = collect(stage)
+        if stage.seed == stage_seed(1, "learn") and stage.frames == 96:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return batch
+
+    runs = [tmp_path / f"{seed}" for seed in (0, 1)]
+    with monkeypatch.context() as patch, StopOnSignal() as stop:
+        patch.setattr(Stage, "collect", collect_and_signal)
+        works = [work(run, seed, "method=sac", stop=stop) for seed, run in enumerate(runs)]
+        ends = together(works)
+    assert [type(end) for end in ends] == [Interrupted, Interrupted]
+    goes_on = [Experiment(resumed_config(run), resume=run).work(StopOnSignal()) for run in runs]
+    assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]

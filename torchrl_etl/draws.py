@@ -1,0 +1,92 @@
+"""Random numbers of losses, which can be drawn beforehand.
+
+A loss takes its random numbers from here, so that several learners that are updated as one can each
+be given the numbers that its own generator would have drawn for it alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["Draw", "given_draws", "recorded_draws", "standard_normal", "standard_uniform", "uniform_order"]
+
+Draw = Callable[[], Tensor]
+
+
+class _Source:
+    """Where the next numbers come from: a list of what is given, or the generator."""
+
+    given: list[Tensor] | None = None
+    recorded: list[Draw] | None = None
+
+
+_source = _Source()
+
+
+def standard_normal(like: Tensor) -> Tensor:
+    """Independent N(0, 1) numbers of the shape of ``like``."""
+    return _next(partial(torch.randn, like.shape, dtype=like.dtype, device=like.device))
+
+
+def standard_uniform(like: Tensor) -> Tensor:
+    """Independent U(0, 1) numbers of the shape of ``like``."""
+    return _next(partial(torch.rand, like.shape, dtype=like.dtype, device=like.device))
+
+
+def uniform_order(count: int, device: torch.device) -> Tensor:
+    """A permutation of ``range(count)``, each as likely as any other."""
+    return _next(partial(torch.randperm, count, device=device))
+
+
+class given_draws(AbstractContextManager):  # noqa: N801
+    """What is drawn within is taken from ``tensors``, one after another.
+
+    Raises:
+        IndexError: where more is drawn than was given.
+
+    Examples:
+        >>> with given_draws([torch.ones(2)]):
+        ...     standard_normal(torch.zeros(2))
+        tensor([1., 1.])
+    """
+
+    def __init__(self, tensors: Iterable[Tensor]) -> None:
+        self.tensors = list(tensors)
+
+    def __enter__(self) -> None:
+        _source.given = self.tensors
+
+    def __exit__(self, *error: Any) -> None:
+        _source.given = None
+
+
+class recorded_draws(AbstractContextManager):  # noqa: N801
+    """Remembers what is drawn within, in a list of functions that draw the like again.
+
+    Examples:
+        >>> with recorded_draws() as draws:
+        ...     _ = standard_normal(torch.zeros(2, 3))
+        >>> [draw().shape for draw in draws]
+        [torch.Size([2, 3])]
+    """
+
+    def __enter__(self) -> list[Draw]:
+        _source.recorded = []
+        return _source.recorded
+
+    def __exit__(self, *error: Any) -> None:
+        _source.recorded = None
+
+
+def _next(draw: Draw) -> Tensor:
+    if _source.given is not None:
+        return _source.given.pop(0)
+    if _source.recorded is not None:
+        _source.recorded.append(draw)
+    return draw()

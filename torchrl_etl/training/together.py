@@ -1,0 +1,85 @@
+"""Several runs that differ in their seeds, in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Generic
+
+from tensordict import TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
+
+from torchrl_etl.learners import SideBySide
+from torchrl_etl.training.loop import Interrupted
+from torchrl_etl.training.work import Due, Result, Work
+
+__all__ = ["together"]
+
+
+def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
+    """Do all works in turns, and updates that are due at the same time as one.
+
+    Each work finds the random generators as it left them, and its updates get the random numbers
+    that it would have drawn for them by itself: it ends with the numbers of
+    :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
+    the others to go on.
+
+    Returns:
+        list: what each work returned, or the exception that ended it.
+    """
+    runs = [_Run(work) for work in works]
+    groups: dict[str, SideBySide] = {}
+    try:
+        for run in runs:
+            run.go_on(None)
+        while waiting := [run for run in runs if run.due is not None]:
+            for stage in dict.fromkeys(run.due.stage for run in waiting):
+                _update([run for run in waiting if run.due.stage == stage], groups)
+    finally:
+        for run in runs:
+            run.work.close()
+    return [run.result for run in runs]
+
+
+class _Run(Generic[Result]):
+    """A work, what it waits for, and its own state of the random generators."""
+
+    def __init__(self, work: Work[Result]) -> None:
+        self.work, self.random = work, GlobalRNGState().state_dict()
+        self.due: Due | None = None
+        self.result: Result | BaseException
+
+    def __enter__(self) -> None:
+        GlobalRNGState().load_state_dict(self.random)
+
+    def __exit__(self, *error: Any) -> None:
+        self.random = GlobalRNGState().state_dict()
+
+    def go_on(self, scalars: TensorDictBase | None) -> None:
+        with self:
+            try:
+                self.due = self.work.send(scalars)
+            except StopIteration as end:
+                self.due, self.result = None, end.value
+            except (Exception, Interrupted) as error:
+                self.due, self.result = None, error
+
+
+def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
+    """Update the learners of these runs, which are in the same stage."""
+    if len(runs) == 1:
+        (run,) = runs
+        with run:
+            scalars = run.due.learner.update(run.due.batch)
+        run.go_on(scalars)
+        return
+    learners = [run.due.learner for run in runs]
+    group = groups.get(stage := runs[0].due.stage)
+    if group is None or group.learners != learners:
+        group = groups[stage] = SideBySide(learners)
+    draws = []
+    for run in runs:
+        with run:
+            draws.append(group.draw(run.due.batch))
+    scalars = group.update([run.due.batch for run in runs], draws)
+    for run, own in zip(runs, scalars, strict=True):
+        run.go_on(own)
