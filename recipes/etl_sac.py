@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from typing import Any
 import gymnasium
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import (
@@ -33,7 +34,9 @@ from torchrl_etl.command_line import (
 )
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.training import Interrupted, resumed_config
+from torchrl_etl.training import Interrupted, resumed_config, together
+from torchrl_etl.training.config import of_each_seed
+from torchrl_etl.training.loop import StopOnSignal
 
 CONF = Path(__file__).parent / "conf"
 SYNERGIES = (
@@ -49,23 +52,43 @@ SYNERGIES = (
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with one_sentence(ValueError, OSError, ImportError, gymnasium.error.Error):
-        given = list(HydraConfig.get().overrides.task)
-        resume = None
-        if config.resume is not None:
-            resume = Path(config.resume)
-            config = resumed_config(resume, given, defaults=hydra.compose("config"))
-        # Two runs that begin in the same second have the same name by default.
-        named = any(override.lstrip("+").startswith("run_dir=") for override in given)
-        experiment = Experiment(config, resume=resume, unique=not named, say=print)
-    try:
-        with one_sentence(OSError, SimulationError, CollectionError):
-            summary = experiment.run()
-    except Interrupted:
-        command = shlex.join(["python", sys.argv[0], f"resume={experiment.folder.path}"])
+        experiments = list(asked_for(config, list(HydraConfig.get().overrides.task)))
+    with StopOnSignal() as stop:
+        ends = together([experiment.work(stop) for experiment in experiments])
+    for experiment, end in zip(experiments, ends, strict=True):
+        if isinstance(end, dict):
+            print(report(end, experiment.folder.path))
+    failures = [end for end in ends if isinstance(end, Exception)]
+    for failure in failures:
+        with suppress(SystemExit), one_sentence(OSError, SimulationError, CollectionError):
+            raise failure
+    stopped = [
+        experiment.folder.path
+        for experiment, end in zip(experiments, ends, strict=True)
+        if isinstance(end, Interrupted)
+    ]
+    if stopped:
+        folders = stopped[0] if len(stopped) == 1 else f"[{','.join(map(str, stopped))}]"
+        command = shlex.join(["python", sys.argv[0], f"resume={folders}"])
         with suppress(OSError):  # the terminal may be gone
             print(f"Stopped and saved. To go on: {command}", flush=True)
-        sys.exit(130)
-    print(report(summary, experiment.folder.path))
+    if failures or stopped:
+        sys.exit(130 if stopped else 2)
+
+
+def asked_for(config: DictConfig, given: list[str]) -> Iterator[Experiment]:
+    """The runs that the configuration asks for, of which there are several with ``seeds``."""
+    if config.resume is not None:
+        folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
+        for folder in map(Path, folders):
+            stored = resumed_config(folder, given, defaults=hydra.compose("config"))
+            yield Experiment(stored, resume=folder, say=print)
+        return
+    # Two runs that begin in the same second have the same name by default.
+    named = any(override.lstrip("+").startswith("run_dir=") for override in given)
+    for own in of_each_seed(config):
+        prefix = "" if config.seeds is None else f"seed {own.seed}: "
+        yield Experiment(own, unique=not named, say=lambda line, p=prefix: print(f"{p}{line}"))
 
 
 def report(summary: dict[str, Any], folder: Path) -> str:

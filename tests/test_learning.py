@@ -11,6 +11,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
+from torchrl_etl.training import alone
 
 
 @pytest.fixture

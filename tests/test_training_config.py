@@ -18,7 +18,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.bundle import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
-from torchrl_etl.training.config import RENAMED
+from torchrl_etl.training.config import RENAMED, of_each_seed
 from torchrl_etl.training.run_folder import RunFolder
 
 GROUPS = {
@@ -297,3 +297,28 @@ def test_former_presets_and_paths_and_kinds_compose():
     assert config == as_null == same
     assert (others.synergies.kind, others.exploration.kind) == ("nmf", "metra")
     assert "hidden" not in others.synergies, "it brings its kind's settings"
+
+
+# Several seeds -----------------------------------------------------------------------------------
+
+
+def test_each_seed_has_the_folder_that_it_would_have_by_itself():
+    config = tiny("seeds=[3,5]", "env=overactuated")
+    config.run_dir, config.progress = "runs/a-${seed}", True
+    configs = of_each_seed(config)
+    assert [(own.seed, own.run_dir, own.progress) for own in configs] == [
+        (3, "runs/a-3", True),
+        (5, "runs/a-5", False),
+    ]
+    assert all(own.seeds is None for own in configs)
+
+
+def test_seeds_that_would_share_a_folder_have_one_each_below_it():
+    configs = of_each_seed(tiny("seeds=[3,5]", "run_dir=runs/a"))
+    assert [own.run_dir for own in configs] == ["runs/a/seed3", "runs/a/seed5"]
+
+
+@pytest.mark.parametrize("seeds", ["[]", "[0,0]", "[0,1.5]", "[true,2]", "3", "text"])
+def test_seeds_that_are_no_list_of_different_seeds_are_one_sentence(seeds):
+    with pytest.raises(ValueError, match=r"seeds is .*; it must be a list of different whole"):
+        of_each_seed(tiny(f"seeds={seeds}", "run_dir=runs/a"))

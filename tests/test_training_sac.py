@@ -13,6 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.configs import RESIDUAL
 from tests.stages import changed, fill, learn_stage, method_stage, snapshot
+from torchrl_etl.training import alone
 
 
 def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():

@@ -16,6 +16,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
+from torchrl_etl.training import alone
 
 
 def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_updates(tmp_path):

@@ -135,7 +135,7 @@ def _former(name: str) -> str | None:
 def quote_paths(arguments: list[str], *keys: str) -> list[str]:
     """Quote the values of path settings, in which Hydra's grammar allows no bracket or space.
 
-    A ``~`` is the home folder, as in the arguments that the shell expands.
+    A ``~`` is the home folder, as in the arguments that the shell expands. A list stays as it is.
 
     Examples:
         >>> quote_paths(["run_dir=/my (new) runs/a", "seed=1"], "run_dir")
@@ -144,7 +144,8 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
     quoted = []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        if key.lstrip("+") in keys and value not in ("", "null"):
+        is_list = value.startswith("[") and value.endswith("]")
+        if key.lstrip("+") in keys and value not in ("", "null") and not is_list:
             if value[0] in "'\"":
                 value = value[0] + os.path.expanduser(value[1:])
             else:

@@ -14,7 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Draw", "given_draws", "recorded_draws", "standard_normal", "standard_uniform", "uniform_order"]
+__all__ = [
+    "Draw",
+    "given_draws",
+    "recorded_draws",
+    "standard_normal",
+    "standard_uniform",
+    "uniform_order",
+]
 
 Draw = Callable[[], Tensor]
 
@@ -44,7 +51,7 @@ def uniform_order(count: int, device: torch.device) -> Tensor:
     return _next(partial(torch.randperm, count, device=device))
 
 
-class given_draws(AbstractContextManager):  # noqa: N801
+class given_draws(AbstractContextManager):
     """What is drawn within is taken from ``tensors``, one after another.
 
     Raises:
@@ -66,7 +73,7 @@ class given_draws(AbstractContextManager):  # noqa: N801
         _source.given = None
 
 
-class recorded_draws(AbstractContextManager):  # noqa: N801
+class recorded_draws(AbstractContextManager):
     """Remembers what is drawn within, in a list of functions that draw the like again.
 
     Examples:

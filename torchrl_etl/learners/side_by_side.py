@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -128,9 +129,7 @@ class SideBySide:
         return [flat[i : i + count] for i in range(0, len(flat), count)], scalars.detach()
 
 
-def stacked(
-    batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]
-) -> TensorDictBase:
+def stacked(batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]) -> TensorDictBase:
     """Batches [B] and random numbers of several learners, as :class:`SideBySide` reads them."""
     given = {f"{i}": torch.stack(each) for i, each in enumerate(zip(*draws, strict=True))}
     size = [len(batches)]

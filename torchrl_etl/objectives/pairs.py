@@ -32,7 +32,7 @@ def partners(
         return (index.unsqueeze(1) + index[1:]) % samples
     # Neighbors on a random circle: a random permutation that maps no sample to itself.
     order = uniform_order(samples, device)
-    return torch.empty_like(order).scatter_(0, order, order.roll(1)).unsqueeze(1)
+    return torch.zeros_like(order).scatter(0, order, order.roll(1)).unsqueeze(1)
 
 
 def outputs(

@@ -242,9 +242,7 @@ def _check_support(support: Tensor) -> None:
         )
 
 
-def drawn(
-    distribution: Distribution, sample_shape: Sequence[int] = ()
-) -> tuple[Tensor, Tensor]:
+def drawn(distribution: Distribution, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
     """Reparametrized samples [S, *, n] with their log-probabilities [S, *].
 
     ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses.

@@ -7,11 +7,8 @@ from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.stage import Stage
-<<<<<<< HEAD
 from torchrl_etl.training.sweep import Run, Sweep
-=======
 from torchrl_etl.training.together import together
->>>>>>> c3b44fe (Runs of several seeds in one process, their updates as one, each with the numbers of a run by itself)
 from torchrl_etl.training.video import check_video_size, record_episodes
 from torchrl_etl.training.work import alone
 
@@ -24,11 +21,8 @@ __all__ = [
     "Interrupted",
     "Run",
     "Stage",
-<<<<<<< HEAD
     "Sweep",
-=======
     "alone",
->>>>>>> c3b44fe (Runs of several seeds in one process, their updates as one, each with the numbers of a run by itself)
     "check_video_size",
     "evaluate",
     "record_episodes",

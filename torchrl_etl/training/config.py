@@ -142,6 +142,35 @@ def validate(config: DictConfig) -> None:
     _check_device(config.device)
 
 
+def of_each_seed(config: DictConfig) -> list[DictConfig]:
+    """The configurations that ``seeds`` asks for, one a run; without it the one that is given.
+
+    Each run has the folder that it would have by itself; where ``run_dir`` does not name the seed,
+    a folder below it does. One of them shows its progress.
+
+    Raises:
+        ValueError: if ``seeds`` is no list of different seeds.
+    """
+    if config.seeds is None:
+        return [config]
+    seeds = list(config.seeds) if isinstance(config.seeds, ListConfig) else []
+    if not seeds or len(set(seeds)) < len(seeds) or any(type(seed) is not int for seed in seeds):
+        raise ValueError(
+            f"seeds is {config.seeds}; it must be a list of different whole numbers, such as "
+            "seeds=[0,1,2]."
+        )
+    configs = []
+    for seed in seeds:
+        own = config.copy()
+        own.seeds, own.seed = None, seed
+        own.progress = config.progress and seed == seeds[0]
+        configs.append(own)
+    if len({own.run_dir for own in configs}) < len(configs):
+        for own in configs:
+            own.run_dir = f"{own.run_dir}/seed{own.seed}"
+    return configs
+
+
 def bfloat16_warning(config: DictConfig) -> str | None:
     """What to say where bodies of that precision are asked for and the processor has no
     instructions for it: PyTorch then emulates its products. ``None`` where all is well.

@@ -10,7 +10,7 @@ from torchrl.checkpoint import GlobalRNGState
 
 from torchrl_etl.learners import SideBySide
 from torchrl_etl.training.loop import Interrupted
-from torchrl_etl.training.work import Due, Result, Work
+from torchrl_etl.training.work import Due, Result, Work, alone
 
 __all__ = ["together"]
 
@@ -26,6 +26,11 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     Returns:
         list: what each work returned, or the exception that ended it.
     """
+    if len(works) == 1:
+        try:
+            return [alone(works[0])]
+        except (Exception, Interrupted) as error:
+            return [error]
     runs = [_Run(work) for work in works]
     groups: dict[str, SideBySide] = {}
     try:
