@@ -14,7 +14,7 @@ from harness import recipe
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.training import Stage
+from torchrl_etl.training import Stage, alone
 
 
 def build(experiment: Experiment, method: str) -> Stage:
@@ -49,7 +49,7 @@ def main() -> None:
         goal = stage.frames + frames
         while stage.frames < goal:
             stage.collect()
-            stage.learn()
+            alone(stage.learn())
 
     train(1000)
     print("ready", flush=True)

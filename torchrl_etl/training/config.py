@@ -22,7 +22,7 @@ from torchrl_etl.extras import extra
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["MAY_CHANGE", "RENAMED", "bfloat16_warning", "validate"]
+__all__ = ["MAY_CHANGE", "RENAMED", "bfloat16_warning", "of_each_seed", "validate"]
 
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
 
@@ -153,7 +153,7 @@ def of_each_seed(config: DictConfig) -> list[DictConfig]:
     """
     if config.seeds is None:
         return [config]
-    seeds = list(config.seeds) if isinstance(config.seeds, ListConfig) else []
+    seeds = list(config.seeds) if isinstance(config.seeds, Sequence) else []
     if not seeds or len(set(seeds)) < len(seeds) or any(type(seed) is not int for seed in seeds):
         raise ValueError(
             f"seeds is {config.seeds}; it must be a list of different whole numbers, such as "
