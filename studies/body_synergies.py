@@ -28,7 +28,7 @@ from torchrl_etl.analysis import control_authority, joint_effects
 from torchrl_etl.command_line import one_sentence, quiet_torchrl
 from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env, resolve_task
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training.run_folder import facts
 
 # Combinations of joints that muscles turn less than so much, beside the one they turn most, would

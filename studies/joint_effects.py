@@ -31,7 +31,7 @@ from torchrl_etl.analysis import joint_effects
 from torchrl_etl.command_line import one_sentence, quiet_torchrl
 from torchrl_etl.envs import excitation, joint_torques, make_env
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import load_bundle
+from torchrl_etl.synergies import load_bundle
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
 

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import load_bundle, save_bundle
+from torchrl_etl.synergies import load_bundle, save_bundle
 
 STEPS, LR = 500, 0.02
 

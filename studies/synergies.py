@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.modules.bundle import load_bundle
+from torchrl_etl.synergies import load_bundle
 
 ROOT = Path(__file__).parent.parent
 READINGS = ("default", "paper")

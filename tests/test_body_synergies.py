@@ -17,7 +17,7 @@ from tests.configs import ROOT, tiny
 from torchrl_etl.analysis import joint_effects
 from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import load_bundle, save_bundle
+from torchrl_etl.synergies import load_bundle, save_bundle
 
 TASK = "myoHandKeyTurn"
 

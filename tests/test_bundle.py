@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from torchrl_etl.envs import actuator_names, make_env
 from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.modules.bundle import (
+from torchrl_etl.synergies import (
     BundleError,
     BundleInfo,
     check_compatible,

@@ -15,7 +15,7 @@ import torch
 
 from tests.configs import ROOT, TINY
 from torchrl_etl.command_line import quote_paths
-from torchrl_etl.modules.bundle import load_bundle, save_bundle
+from torchrl_etl.synergies import load_bundle, save_bundle
 
 SMALL = [override for override in TINY if not override.startswith("env=")]
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from tests.test_modules import HIGH, LOW, bias_of_last_layer, same, uniform, weights
 from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules import GMVAE, SynergyDecoder
-from torchrl_etl.modules.bundle import load_bundle, save_bundle
+from torchrl_etl.synergies import load_bundle, save_bundle
 
 
 @pytest.fixture(autouse=True)

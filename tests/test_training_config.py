@@ -16,7 +16,7 @@ from torchrl_etl.envs import list_tasks
 from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
 from torchrl_etl.training.config import RENAMED, of_each_seed
 from torchrl_etl.training.run_folder import RunFolder

@@ -16,7 +16,7 @@ from torchrl_etl.envs import SimulationError
 from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.stage import Stage
 

@@ -19,7 +19,7 @@ from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.sar import finished_episodes, rollouts
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import save_bundle
+from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
 

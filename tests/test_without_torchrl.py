@@ -19,7 +19,7 @@ from tests.configs import ROOT
 from tests.test_docs import BLOCK
 from torchrl_etl.envs import SynergyActionWrapper, actuator_names, make_env
 from torchrl_etl.modules import SynergyDecoder, make_actor, policy_function
-from torchrl_etl.modules.bundle import BundleError, save_bundle
+from torchrl_etl.synergies import BundleError, save_bundle
 from torchrl_etl.transforms import SynergyAction
 
 TASK = "torchrl_etl/Overactuated-v0"

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from torchrl_etl.modules.bundle import load_bundle
+from torchrl_etl.synergies import load_bundle
 
 ROOT = Path(__file__).parents[2]
 TASKS = ("myo2HandPose", "myoHandKeyTurn", "myoHandPenTwirl")

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from torchrl_etl.modules.bundle import load_bundle
+from torchrl_etl.synergies import load_bundle
 
 from .learner import Learner
 from .returns import ReturnScales

@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_positive
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
-from torchrl_etl.modules.synergy_decoder import SynergyMap
 from torchrl_etl.synergies.sar import independent_components
 
 __all__ = ["SARDecoder", "best_episodes"]

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from torchrl_etl.envs.action_space import check_action_space
 from torchrl_etl.envs.factory import actuator_names
 from torchrl_etl.modules import SynergyMap
-from torchrl_etl.modules.bundle import check_compatible, load_bundle
+from torchrl_etl.synergies import check_compatible, load_bundle
 
 __all__ = ["SynergyActionWrapper"]
 

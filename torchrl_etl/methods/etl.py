@@ -17,14 +17,14 @@ from torchrl_etl.learners import Term
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.modules.bundle import (
+from torchrl_etl.objectives import DecoderLoss
+from torchrl_etl.synergies import (
     BundleInfo,
     check_compatible,
     copy_bundle,
     load_bundle,
     save_bundle,
 )
-from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts

@@ -7,7 +7,8 @@ from torchrl_etl.modules.policy_function import policy_function
 from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
-from torchrl_etl.modules.synergy_decoder import SynergyDecoder, SynergyMap
+from torchrl_etl.modules.synergy_decoder import SynergyDecoder
+from torchrl_etl.modules.synergy_map import SynergyMap
 from torchrl_etl.modules.uniform_warmup import UniformWarmup
 from torchrl_etl.modules.unit_rows import normalize_rows
 

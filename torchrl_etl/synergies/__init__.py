@@ -1,7 +1,8 @@
 """What condenses muscle actions into synergies, one kind a file."""
 
-from torchrl_etl.modules.bundle import load_bundle, save_bundle
 from torchrl_etl.synergies.affine import AffineSynergies
+from torchrl_etl.synergies.bundle import copy_bundle, load_bundle, save_bundle
+from torchrl_etl.synergies.bundle_info import BundleError, BundleInfo, check_compatible
 from torchrl_etl.synergies.fit import SYNERGY_MODELS, fit_synergies
 from torchrl_etl.synergies.gmvae import GMVAESynergies, fit_gmvae
 from torchrl_etl.synergies.model import SynergyModel
@@ -15,6 +16,8 @@ from torchrl_etl.synergies.vae import VAESynergies
 __all__ = [
     "SYNERGY_MODELS",
     "AffineSynergies",
+    "BundleError",
+    "BundleInfo",
     "GMVAESynergies",
     "NMFSynergies",
     "PCASynergies",
@@ -23,6 +26,8 @@ __all__ = [
     "ShownActions",
     "SynergyModel",
     "VAESynergies",
+    "check_compatible",
+    "copy_bundle",
     "fit_gmvae",
     "fit_synergies",
     "load_bundle",

@@ -13,8 +13,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from difflib import get_close_matches
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,63 +21,22 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 from tensordict.utils import NestedKey
-from torch import Tensor
 
 from torchrl_etl.io import replace_folder, surviving_folder
-from torchrl_etl.modules.gmvae import GMVAE
-from torchrl_etl.modules.synergy_decoder import SynergyDecoder
+from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.synergies.bundle_info import (
+    DESCRIPTION,
+    BundleError,
+    BundleInfo,
+    default_kind,
+    read_description,
+    some,
+)
 
-__all__ = [
-    "BundleError",
-    "BundleInfo",
-    "check_compatible",
-    "copy_bundle",
-    "load_bundle",
-    "save_bundle",
-]
+__all__ = ["copy_bundle", "load_bundle", "save_bundle"]
 
-FORMAT_VERSION = 2  # 1 had neither kind nor encoder
 _ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
-_DESCRIPTION = "synergies.json"
-
-
-class BundleError(ValueError):
-    """A synergy bundle cannot be written, read or used; the message says why and what helps."""
-
-
-@dataclass(frozen=True)
-class BundleInfo:
-    """What ``synergies.json`` says.
-
-    Args:
-        task (str): the task whose exploration gave the synergies.
-        actuators (tuple of str): names of the n actuators, in action order.
-        low, high (tuple of float): action bounds [n].
-        num_synergies (int): number d of synergies.
-        residual (float): residual share of the decoder.
-        config (dict): constructor arguments of the decoder.
-        sha256 (str): digest of the tensors file.
-        num_components (int, optional): mixture components of the GMVAE it came from.
-        facts (dict): frames, seed, commit, versions, variance accounted for, and the like.
-        kind (str): kind of synergies, such as ``"gmvae"`` or ``"nmf"``.
-        encoder (dict, optional): constructor arguments of the encoder, if there is one.
-        format_version (int): version of this layout.
-    """
-
-    task: str
-    actuators: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    num_synergies: int
-    residual: float
-    config: dict[str, Any]
-    sha256: str
-    num_components: int | None = None
-    facts: dict[str, Any] = field(default_factory=dict)
-    kind: str = "gmvae"
-    encoder: dict[str, Any] | None = None
-    format_version: int = FORMAT_VERSION
 
 
 def save_bundle(
@@ -163,21 +121,21 @@ def save_bundle(
         sha256=hashlib.sha256(tensors).hexdigest(),
         num_components=num_components,
         facts=_plain(dict(facts or {}), "facts"),
-        kind=_default_kind(decoder.is_affine) if kind is None else kind,
+        kind=default_kind(decoder.is_affine) if kind is None else kind,
         encoder=None if encoder is None else encoder.config,
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
     folder = Path(path).resolve()
     if folder.exists() and (
         not folder.is_dir()
-        or (others := {file.name for file in folder.iterdir()} - {_TENSORS, _DESCRIPTION})
+        or (others := {file.name for file in folder.iterdir()} - {_TENSORS, DESCRIPTION})
     ):
-        held = f"holds {_some(sorted(others))}" if folder.is_dir() else "is a file"
+        held = f"holds {some(sorted(others))}" if folder.is_dir() else "is a file"
         raise BundleError(
             f"{str(folder)!r} {held}, and saving a bundle there would remove it; choose a folder "
             "of its own, such as synergies/ in the run folder."
         )
-    replace_folder(folder, {_TENSORS: tensors, _DESCRIPTION: description})
+    replace_folder(folder, {_TENSORS: tensors, DESCRIPTION: description})
     return folder
 
 
@@ -210,10 +168,10 @@ def load_bundle(
         >>> load_bundle("nowhere")
         Traceback (most recent call last):
         ...
-        torchrl_etl.modules.bundle.BundleError: There is no synergy bundle at 'nowhere'; ...
+        torchrl_etl.synergies.bundle_info.BundleError: There is no synergy bundle at 'nowhere'; ...
     """
     folder = _find_folder(Path(path))
-    info = _read_description(folder)
+    info = read_description(folder)
     try:
         content = (folder / _TENSORS).read_bytes()
     except OSError as error:
@@ -224,7 +182,7 @@ def load_bundle(
     if hashlib.sha256(content).hexdigest() != info.sha256:
         raise BundleError(
             f"{_TENSORS} in {str(folder)!r} is damaged or belongs to another bundle: its SHA-256 "
-            f"is not the one in {_DESCRIPTION}; copy both files again."
+            f"is not the one in {DESCRIPTION}; copy both files again."
         )
     try:
         state = safetensors.torch.load(content)
@@ -251,7 +209,7 @@ def load_bundle(
     bounds = tuple(decoder.low.tolist()), tuple(decoder.high.tolist())
     if bounds != (info.low, info.high) or decoder.action_dim != len(info.actuators):
         raise BundleError(
-            f"{_DESCRIPTION} in {str(folder)!r} states {len(info.actuators)} actuators or bounds "
+            f"{DESCRIPTION} in {str(folder)!r} states {len(info.actuators)} actuators or bounds "
             f"that its decoder of {decoder.action_dim} actuators does not have; it was edited, so "
             "copy the bundle again."
         )
@@ -284,97 +242,9 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
     load_bundle(source)
     folder, target = _find_folder(Path(source)), Path(target).resolve()
     if folder != target:
-        names = (_TENSORS, _DESCRIPTION)
+        names = (_TENSORS, DESCRIPTION)
         replace_folder(target, {name: (folder / name).read_bytes() for name in names})
     return target
-
-
-def check_compatible(
-    info: BundleInfo,
-    actuators: Sequence[str],
-    low: float | Sequence[float] | Tensor,
-    high: float | Sequence[float] | Tensor,
-) -> None:
-    """Refuse a bundle whose actuators or bounds are not the environment's.
-
-    Args:
-        info (BundleInfo): what :func:`load_bundle` returned.
-        actuators (sequence of str): the environment's actuator names, in action order.
-        low, high (float, sequence of float or Tensor): its action bounds, one or [n].
-
-    Raises:
-        BundleError: naming what came, what was expected and the likeliest explanation.
-
-    Examples:
-        >>> from torchrl_etl.modules.bundle import BundleInfo
-        >>> info = BundleInfo("toy", ("a", "b"), (0.0, 0.0), (1.0, 1.0), 1, 0.0, {}, "")
-        >>> check_compatible(info, ["a", "b"], 0.0, 1.0)
-        >>> check_compatible(info, ["b", "a"], 0.0, 1.0)
-        Traceback (most recent call last):
-        ...
-        torchrl_etl.modules.bundle.BundleError: The bundle of 'toy' and the environment have the
-        same 2 actuators in another order (number 0 is 'a' in the bundle, 'b' in the environment);
-        ...
-    """
-    actuators = tuple(actuators)
-    if actuators != info.actuators:
-        raise BundleError(_explain_names(info, actuators))
-    for side, ours, theirs in (("lower", info.low, low), ("upper", info.high, high)):
-        ours = torch.tensor(ours, dtype=torch.float64)
-        theirs = torch.as_tensor(theirs).detach().cpu().double().expand(len(ours))
-        differ = ~torch.isclose(ours, theirs, rtol=1e-5, atol=1e-6)
-        if differ.any():
-            first = int(differ.nonzero()[0])
-            raise BundleError(
-                f"The bundle of {info.task!r} has other {side} action bounds than the environment "
-                f"for {int(differ.sum())} of {len(ours)} actuators ({actuators[first]!r}: "
-                f"{ours[first]:g} in the bundle, {theirs[first]:g} in the environment); the action "
-                "is scaled otherwise, as happens between versions of a simulator or with another "
-                "action wrapper, so use the same ones or explore anew."
-            )
-
-
-def _default_kind(is_affine: bool) -> str:
-    return "affine" if is_affine else "gmvae"
-
-
-def _explain_names(info: BundleInfo, actuators: tuple[str, ...]) -> str:
-    missing = [name for name in info.actuators if name not in actuators]
-    extra = [name for name in actuators if name not in info.actuators]
-    ours, theirs = len(info.actuators), len(actuators)
-    start = f"The bundle of {info.task!r}"
-    if not missing and not extra:
-        where = next(i for i in range(ours) if info.actuators[i] != actuators[i])
-        return (
-            f"{start} and the environment have the same {ours} actuators in another order (number "
-            f"{where} is {info.actuators[where]!r} in the bundle, {actuators[where]!r} in the "
-            "environment); bring the environment's actions into the bundle's order."
-        )
-    counts = f"{start} moves {ours} actuators and the environment has {theirs}"
-    if len(missing) == ours:
-        return f"{counts}, with no name in common: it is for another body, so explore on this one."
-    if not missing:
-        return (
-            f"{counts}, among them all of the bundle's (it lacks {_some(extra)}): it was made on a "
-            "part of this body, so explore on the whole."
-        )
-    if not extra:
-        return (
-            f"{counts}, all of them in the bundle (which also moves {_some(missing)}): it was made "
-            "on a larger body, so explore on this one."
-        )
-    near = {name: get_close_matches(name, extra, n=1, cutoff=0.8) for name in missing}
-    renamed = [f"{name!r} for {match[0]!r}" for name, match in near.items() if match]
-    hint = f"; perhaps renamed: {', '.join(renamed[:3])}" if renamed else ""
-    return (
-        f"{counts}; only the bundle has {_some(missing)}, only the environment has {_some(extra)}"
-        f"{hint}; use a bundle made on this body."
-    )
-
-
-def _some(names: Sequence[str]) -> str:
-    rest = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(map(repr, names[:3])) + rest
 
 
 def _plain(value: Any, where: str) -> Any:
@@ -400,54 +270,9 @@ def _plain(value: Any, where: str) -> Any:
 def _find_folder(path: Path) -> Path:
     for candidate in (path, path / "synergies"):
         folder = surviving_folder(candidate.resolve())
-        if (folder / _DESCRIPTION).exists() or (folder / _TENSORS).exists():
+        if (folder / DESCRIPTION).exists() or (folder / _TENSORS).exists():
             return folder
     raise BundleError(
-        f"There is no synergy bundle at {str(path)!r}; pass the folder that holds {_DESCRIPTION} "
+        f"There is no synergy bundle at {str(path)!r}; pass the folder that holds {DESCRIPTION} "
         f"and {_TENSORS}, or a run folder with such a folder named synergies."
     )
-
-
-def _read_description(folder: Path) -> BundleInfo:
-    name = f"{_DESCRIPTION} in {str(folder)!r}"
-    try:
-        content = json.loads((folder / _DESCRIPTION).read_bytes())
-    except OSError as error:
-        raise BundleError(
-            f"{name} cannot be read ({error.strerror}); copy the bundle again, with both its files."
-        ) from error
-    except ValueError as error:
-        raise BundleError(f"{name} is not JSON ({error}); copy the bundle again.") from error
-    version = content.get("format_version") if isinstance(content, dict) else None
-    if version is None:
-        raise BundleError(f"{name} has no format_version: it does not describe a synergy bundle.")
-    if version not in (1, FORMAT_VERSION):
-        raise BundleError(
-            f"{name} has format version {version!r} and this torchrl_etl reads 1 and "
-            f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
-        )
-    known = {item.name for item in fields(BundleInfo)}
-    if version == 1:
-        content = {"kind": "", "encoder": None, **content}
-    if set(content) != known:
-        missing, extra = sorted(known - set(content)), sorted(set(content) - known)
-        raise BundleError(
-            f"{name} lacks {missing} and has the unknown {extra}; it was edited, so copy the "
-            "bundle again."
-        )
-    kinds = {"actuators": list, "low": list, "high": list, "config": dict, "facts": dict}
-    for key, kind in kinds.items():
-        if not isinstance(content[key], kind):
-            raise BundleError(
-                f"{name} has {content[key]!r} as {key} where a JSON "
-                f"{'array' if kind is list else 'object'} belongs; copy the bundle again."
-            )
-    if version == 1:
-        content["kind"] = _default_kind(not content["config"].get("hidden", True))
-    if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
-        raise BundleError(
-            f"{name} has {content['kind']!r} as kind, which must be a text, and "
-            f"{content['encoder']!r} as encoder, an object or null; copy the bundle again."
-        )
-    content |= {key: tuple(content[key]) for key in ("actuators", "low", "high")}
-    return BundleInfo(**content)
