@@ -1,0 +1,60 @@
+"""Look at a body in the browser: its synergies under sliders, its policies at work.
+
+    python recipes/view.py run=runs/NAME
+    python recipes/view.py bundle=runs/NAME/synergies env=myoHandPenTwirl
+    ssh -L 8080:localhost:8080 MACHINE     # for a run on another machine
+
+These are all settings, with their defaults:
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_etl.analysis.viewer import Session, Subject
+from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
+from torchrl_etl.opened import open_bundle, open_run
+
+CONF = Path(__file__).parent / "conf"
+SOURCES = ("run", "bundle")
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="view")
+def main(config: DictConfig) -> None:
+    quiet_torchrl()
+    with one_sentence(ValueError, OSError, ImportError):
+        from torchrl_etl.analysis.viewer.page import Page, check_port  # needs an extra
+
+        check_port(config.host, config.port)
+        session = Session(open_subject(config))
+        page = Page(session, host=config.host, port=config.port, say=print)
+    print(f"{session.subject.name} is shown at {page.address} (Ctrl-C ends it)", flush=True)
+    try:
+        page.run()
+    except KeyboardInterrupt:
+        print("The viewer has ended.")
+
+
+def open_subject(config: DictConfig) -> Subject:
+    """What the settings name, which must be one thing."""
+    named = [source for source in SOURCES if config[source] is not None]
+    if len(named) != 1:
+        raise ValueError(
+            f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
+            "pass run=PATH, the folder that etl_sac.py printed, or bundle=PATH env=TASK."
+        )
+    if named == ["run"]:
+        if config.env is not None or config.goal is not None:
+            raise ValueError("A run has a task of its own; leave env and goal out.")
+        return open_run(Path(config.run), defaults=hydra.compose("config"))
+    return open_bundle(Path(config.bundle), config.env, goal=config.goal)
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = quote_paths(sys.argv[1:], *SOURCES)
+    check_overrides(CONF / "view.yaml", sys.argv[1:], __doc__)
+    main()

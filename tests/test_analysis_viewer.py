@@ -1,0 +1,227 @@
+"""What the viewer's buttons do, without a browser."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+from torchrl_etl.analysis.viewer import Session, Subject
+from torchrl_etl.analysis.viewer.muscles import activations, colors, driven_muscles, paths
+from torchrl_etl.analysis.viewer.words import activation_grid, driven_list, status
+from torchrl_etl.envs import actuator_names, make_env, resolve_task
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.training.evaluation import evaluate
+
+
+def make_decoder(residual: float = 0.0) -> SynergyDecoder:
+    torch.manual_seed(0)
+    return SynergyDecoder.from_directions(
+        torch.zeros(16), torch.randn(2, 16) / 4, residual=residual
+    )
+
+
+def acting(value: float, decoder: SynergyDecoder) -> TensorDictSequential:
+    """A policy that always emits one number in all entries, and decodes it."""
+
+    def emit(observation: torch.Tensor) -> torch.Tensor:
+        return observation.new_full((*observation.shape[:-1], decoder.synergy_dim), value)
+
+    return TensorDictSequential(TensorDictModule(emit, ["observation"], ["synergy"]), decoder)
+
+
+def open_session(**parts) -> Session:
+    subject = Subject(
+        "an example",
+        resolve_task("overactuated"),
+        lambda goal: make_env("overactuated", goal=goal),
+        actuator_names("overactuated"),
+        episode_steps=25,
+        first_seed=7,
+    )
+    parts = parts or {"decoder": make_decoder()}
+    return Session(replace(subject, **parts))
+
+
+def test_a_paused_session_lets_time_pass_without_a_step():
+    session = open_session()
+    assert session.advance(10.0) == 0 and session.steps == 0
+
+
+def test_a_slider_moves_the_muscles_at_once_and_then_the_body_rests():
+    session = open_session()
+    session.move(1, 0.5)
+    assert session.advance(0.1, patience=10.0) == 5  # 20 ms a step
+    expected = session.subject.decoder(torch.tensor([0.0, 0.5])).detach()
+    assert torch.equal(session.action, expected)
+    assert sum(session.advance(0.1, patience=10.0) for _ in range(20)) == 25  # 0.6 seconds in all
+    assert not session.playing
+
+
+def test_playing_takes_as_many_steps_as_its_speed_says():
+    session = open_session()
+    session.playing, session.speed = True, 0.5
+    assert session.advance(0.4, patience=10.0) == 10
+    assert session.steps == 10
+
+
+def test_a_slow_simulator_falls_behind_and_owes_nothing():
+    session = open_session()
+    session.playing = True
+    assert session.advance(3600.0, patience=0.01) < 1000
+    assert session.advance(0.02, patience=10.0) == 1
+
+
+def test_sliders_go_on_after_the_end_and_a_policy_begins_the_next_episode():
+    decoder = make_decoder()
+    session = open_session(decoder=decoder, policy=acting(0.3, decoder))
+    assert session.driver == "policy"
+    for _ in range(25):
+        session.step()
+    assert session.over
+    session.move(0, 0.1)
+    session.step()
+    assert (session.episode, session.steps) == (0, 26)
+    session.drive("policy")
+    session.step()
+    assert (session.episode, session.steps) == (1, 1)
+
+
+def test_an_episode_is_the_one_that_evaluation_sees():
+    decoder = make_decoder()
+    policy = acting(0.3, decoder)
+    session = open_session(decoder=decoder, policy=policy)
+    session.reset(1)
+    while not session.over:
+        session.step()
+    found = evaluate(policy, make_env("overactuated"), episodes=2, max_steps=25, seed=7)
+    assert session.total_reward == pytest.approx(found.returns[1])
+    assert session.solved_steps == found.solved_steps[1]
+
+
+def test_the_policy_s_coefficients_stand_on_the_sliders():
+    decoder = make_decoder()
+    session = open_session(decoder=decoder, policy=acting(0.25, decoder))
+    session.step()
+    assert session.coefficients.tolist() == [0.25, 0.25]
+
+
+def test_without_its_residual_a_policy_moves_muscles_through_synergies_alone():
+    decoder = make_decoder(residual=0.5)
+    session = open_session(decoder=decoder, policy=acting(0.25, decoder))
+    assert session.has_residual
+    session.step()
+    whole = session.action
+    session.residual = False
+    session.step()
+    alone = decoder(torch.cat([torch.full((2,), 0.25), torch.zeros(16)])).detach()
+    assert torch.equal(session.action, alone) and not torch.equal(whole, alone)
+
+
+def test_stage_1_s_policy_follows_the_direction_that_is_chosen():
+    seen = []
+
+    def act(observation: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        seen.append(direction.clone())
+        return observation.new_zeros(16)
+
+    explorer = TensorDictModule(act, ["observation", "direction"], ["action"])
+    session = open_session(explorer=explorer, direction_dim=3)
+    session.step()
+    session.follow(torch.tensor([0.0, -2.0, 0.0]))
+    session.step()
+    assert [direction.tolist() for direction in seen] == [[1, 0, 0], [0, -1, 0]]
+    with pytest.raises(ValueError, match="3 numbers that are not all zero"):
+        session.follow(torch.zeros(3))
+
+
+def test_another_goal_begins_anew_in_a_simulator_of_its_own():
+    session = open_session()
+    first = session.env
+    session.step()
+    session.choose_goal("random")
+    assert session.env is not first and session.goal == "random" and session.steps == 0
+    with pytest.raises(ValueError, match="goal is 'near'; choose one of fixed, random"):
+        session.choose_goal("near")
+
+
+def test_what_nothing_can_move_is_refused():
+    with pytest.raises(ValueError, match="neither a policy nor synergies"):
+        open_session(decoder=None)
+
+
+def test_a_coefficient_out_of_its_box_is_refused():
+    with pytest.raises(ValueError, match=re.escape("in [-1, 1]")):
+        open_session().move(0, 1.5)
+
+
+# A body of its own: a motor on a hinge, and a muscle whose tendon runs straight up.
+BODY = """
+<mujoco>
+  <worldbody>
+    <site name="low" pos="0 0 0"/>
+    <body name="box" pos="0 0 1">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom size=".1"/>
+      <site name="high" pos="0 0 0"/>
+    </body>
+  </worldbody>
+  <tendon><spatial name="cord"><site site="low"/><site site="high"/></spatial></tendon>
+  <actuator>
+    <motor joint="hinge" ctrlrange="-2 2"/>
+    <muscle tendon="cord" ctrllimited="true" ctrlrange="0 1" lengthrange=".5 1.5"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def body() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = mujoco.MjModel.from_xml_string(BODY)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_tendons_run_where_their_sites_are_and_motors_sit_at_their_joints(body):
+    path = paths(*body)
+    np.testing.assert_allclose(path.start, [[0, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(path.end, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
+    assert path.actuator.tolist() == [1, 0]
+
+
+def test_a_muscle_is_as_active_as_its_state_and_a_motor_as_its_control(body):
+    model, data = body
+    data.ctrl[:], data.act[:] = [-1.0, 0.9], [0.25]
+    assert activations(model, data).tolist() == [-0.5, 0.25]
+
+
+def test_rest_pull_and_push_have_colours_of_their_own():
+    rest, pull, push = colors(np.array([0.0, 1.0, -1.0])).astype(int)
+    assert pull[0] > rest[0] > push[0] and push[2] > rest[2] > pull[2]
+
+
+def test_driven_muscles_are_the_heat_map_s_strongest_first():
+    directions = torch.tensor([[0.0, 0.5, -1.0], [0.001, 0.0, 0.0]])
+    decoder = SynergyDecoder.from_directions(torch.zeros(3), directions)
+    first, second = driven_muscles(decoder, ["a", "b", "c"])
+    assert [name for name, _ in first] == ["c", "b"] and second == []
+    # (tanh 1 - tanh -1) / 2, of a range of 2.
+    assert first[0][1] == pytest.approx(-np.tanh(1.0))
+
+
+def test_names_from_a_model_are_no_html():
+    assert "<b>" not in driven_list([("<b>", 0.5)])
+    assert "<b>" not in activation_grid(["<b>"], np.zeros(1))
+
+
+def test_the_page_tells_return_and_whether_the_episode_counts_as_solved():
+    session = open_session()
+    assert "return <b>0.0</b>" in status(session) and "0 steps of 6 needed" in status(session)
+    session.solved, session.solved_steps = True, 6
+    assert session.success and "<b>solved</b>" in status(session)

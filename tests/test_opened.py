@@ -1,0 +1,118 @@
+"""Runs and bundles that are opened to be looked at."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import socket
+
+import pytest
+from omegaconf import OmegaConf
+
+from tests.configs import ROOT, tiny
+from torchrl_etl.analysis.viewer import Session
+from torchrl_etl.analysis.viewer.page import Page, check_port
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.opened import open_bundle, open_run
+from torchrl_etl.synergies import BundleError
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a tiny run of both stages."""
+    folder = tmp_path_factory.mktemp("runs") / "etl"
+    short = ("explore.frames=128", "learn.frames=128", "evaluation.episodes=2")
+    Experiment(tiny(f"run_dir='{folder}'", "learn.decoder.residual=0.2", *short)).run()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def opened(finished):
+    return open_run(finished)
+
+
+def test_a_run_of_both_stages_can_be_moved_by_its_policy_by_sliders_and_along_directions(opened):
+    assert opened.drivers == ["policy", "sliders", "explorer"]
+    assert opened.decoder.num_synergies == 2 and opened.direction_dim > 0
+    with Session(opened) as session:
+        assert session.has_residual
+        for driver in opened.drivers:
+            session.drive(driver)
+            session.step()
+
+
+def test_episode_0_of_a_run_is_the_first_that_it_is_evaluated_on(opened, finished):
+    experiment = Experiment(OmegaConf.load(finished / "config.yaml"), resume=finished)
+    found = experiment.evaluator(experiment.learned())()
+    with Session(opened) as session:
+        while not session.over:
+            session.step()
+    assert session.total_reward == pytest.approx(found.returns[0], rel=1e-5)
+
+
+def test_a_run_that_has_explored_only_is_moved_by_sliders_and_along_directions(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "learn")
+    assert open_run(tmp_path / "run").drivers == ["sliders", "explorer"]
+
+
+def test_a_run_without_policy_and_synergies_is_refused(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    for part in ("checkpoints", "synergies"):
+        shutil.rmtree(tmp_path / "run" / part)
+    with pytest.raises(ValueError, match=r"neither a policy .* nor synergies"):
+        open_run(tmp_path / "run")
+
+
+def test_a_bundle_is_shown_on_the_task_that_it_was_explored_on(finished):
+    subject = open_bundle(finished)
+    assert subject.drivers == ["sliders"] and subject.task.name == "overactuated"
+    assert subject.decoder.residual == 0.0
+
+
+def test_a_bundle_of_another_body_is_refused(finished):
+    with pytest.raises(BundleError, match="it is for another body"):
+        open_bundle(finished, "humanoid-stand")
+
+
+def test_what_has_no_body_to_draw_is_refused_before_anything_listens(opened):
+    with Session(opened) as session, pytest.raises(ValueError, match="does not run on MuJoCo"):
+        Page(session, port=0)
+
+
+def test_a_busy_port_is_refused_and_another_one_proposed():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(ValueError, match=re.escape("pass another port, or port=0")):
+            check_port("127.0.0.1", other.getsockname()[1])
+
+
+@pytest.mark.parametrize("port", [-1, 65536, "http", True, None])
+def test_what_is_no_port_is_refused(port):
+    with pytest.raises(ValueError, match=r"from 0 .* to 65535"):
+        check_port("127.0.0.1", port)
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    spec = importlib.util.spec_from_file_location("view", ROOT / "recipes" / "view.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "nothing to look at was named; pass run=PATH"),
+        ({"run": "a", "bundle": "b"}, "run and bundle were named"),
+        ({"run": "a", "env": "dog-run"}, "leave env and goal out"),
+        ({"bundle": "nowhere"}, "no synergy bundle at 'nowhere'"),
+    ],
+)
+def test_view_says_in_a_sentence_what_to_name(recipe, settings, message):
+    defaults = OmegaConf.load(ROOT / "recipes" / "conf" / "view.yaml")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        recipe.open_subject(OmegaConf.merge(defaults, settings))
