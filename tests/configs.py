@@ -64,7 +64,11 @@ def _composed(conf: Path, name: str, *overrides: str) -> DictConfig:
 
 def _is_there(setting: str, overrides: Sequence[str], conf: Path) -> bool:
     section, _, key = setting.partition("=")[0].partition(".")
-    chosen = [value for name, _, value in (o.partition("=") for o in overrides) if name == section]
-    if not key or not chosen or not (file := conf / section / f"{chosen[-1]}.yaml").is_file():
+    given = {name: value for name, _, value in (o.partition("=") for o in overrides)}
+    kind = given.get(section)
+    if kind is None and (method := given.get("method")):  # which may bring one
+        for default in OmegaConf.load(conf / "method" / f"{method}.yaml").get("defaults", ()):
+            kind = default.get(f"override /{section}", kind)
+    if not key or kind is None or not (file := conf / section / f"{kind}.yaml").is_file():
         return True
     return OmegaConf.select(OmegaConf.load(file), key) is not None
