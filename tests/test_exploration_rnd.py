@@ -8,6 +8,7 @@ import torch
 from tests.stages import changed, explorer, fill, goes_on_after_a_load, snapshot
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.exploration import RNDExploration
+from torchrl_etl.learners import SideBySide
 
 SMALL = ("exploration=rnd", "exploration.hidden=[16]", "exploration.features=8")
 
@@ -53,7 +54,7 @@ def test_the_bonus_of_what_the_predictor_learned_fades():
     torch.manual_seed(0)
     spec = EnvironmentSpec.of(make_env("overactuated"))
     scale = {"normalize": False}
-    rnd = RNDExploration(spec, features=8, hidden=[16], lr=1e-2, update_fraction=1.0, bonus=scale)
+    rnd = RNDExploration(spec, features=8, hidden=[16], lr=1e-2, bonus=scale)
     (bonus,), (term,) = rnd.batch_transforms(), rnd.terms()
     rows = make_env("overactuated").rollout(50, break_when_any_done=False)
     first = bonus(rows)["next", "intrinsic_reward"].mean()
@@ -63,6 +64,31 @@ def test_the_bonus_of_what_the_predictor_learned_fades():
         term(rows)[0].backward()
         optimizer.step()
     assert bonus(rows)["next", "intrinsic_reward"].mean() < 0.2 * first
+
+
+def test_seeds_side_by_side_learn_what_each_learns_alone():
+    twins = [[explorer(*SMALL, f"seed={seed}") for seed in (0, 1)] for _ in range(2)]
+    for found in (found for pair in twins for found in pair):
+        found.stage.restart_collection()
+        found.stage.collect()
+        found.stage.close()
+    batches = []
+    for found in twins[0]:
+        torch.manual_seed(0)
+        batches.append(found.stage.sample())
+    group = SideBySide([found.stage.learner for found in twins[0]])
+    draws = []
+    for batch in batches:
+        torch.manual_seed(1)
+        draws.append(group.draw(batch))
+    together = group.update(batches, draws)
+    for found, batch, scalars in zip(twins[1], batches, together, strict=True):
+        torch.manual_seed(0)
+        assert (found.stage.sample() == batch).all()
+        torch.manual_seed(1)
+        alone = found.stage.learner.update(batch)
+        for key in ("loss_predictor", "loss_actor", "loss_qvalue"):
+            torch.testing.assert_close(scalars[key], alone[key])
 
 
 def test_a_resumed_stage_goes_on_with_the_same_numbers(tmp_path):
@@ -75,7 +101,6 @@ def test_a_resumed_stage_goes_on_with_the_same_numbers(tmp_path):
         ("features=0", "exploration.features is 0"),
         ("hidden=[]", "exploration.hidden is"),
         ("lr=0", "exploration.lr is 0"),
-        ("update_fraction=0", "exploration.update_fraction is 0"),
         ("bonus.decay=1", "exploration.bonus.decay is 1"),
     ],
 )

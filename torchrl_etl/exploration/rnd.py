@@ -23,7 +23,8 @@ __all__ = ["RNDExploration"]
 class RNDExploration(Exploration):
     """What was seldom seen is rewarded: its random features are predicted badly (Burda 2018).
 
-    The loss is TorchRL's. Nothing is drawn at reset, and the policy reads the observation alone.
+    The loss is TorchRL's, of whole batches: the paper masks three quarters of what many simulators
+    give at once. Nothing is drawn at reset, and the policy reads the observation alone.
 
     Equation: see :class:`~torchrl_etl.transforms.RNDBonus`.
 
@@ -34,7 +35,6 @@ class RNDExploration(Exploration):
         features (int): outputs of the random network.
         hidden (sequence of int): widths of its layers and of the predictor's.
         lr (float): learning rate of the predictor.
-        update_fraction (float): share of each batch that the predictor learns from.
         bonus (mapping): keyword arguments of :class:`~torchrl_etl.transforms.ScaledBonus`.
     """
 
@@ -47,20 +47,18 @@ class RNDExploration(Exploration):
         features: int,
         hidden: Sequence[int],
         lr: float,
-        update_fraction: float,
         bonus: Mapping[str, Any],
     ) -> None:
         super().__init__(spec)
         check_positive(features=features)
         check_sizes(hidden=hidden)
         check_real("(0, inf)", lr=lr)
-        check_real("(0, 1]", update_fraction=update_fraction)
         target, predictor = (
             MLP(spec.observation_dim, features, num_cells=hidden, activation_class=nn.ReLU)
             for _ in range(2)
         )
         statistics = RunningMeanStd((spec.observation_dim,))
-        loss = RNDLoss(predictor, target, obs_rms=statistics, update_fraction=update_fraction)
+        loss = RNDLoss(predictor, target, obs_rms=statistics, update_fraction=1.0)
         self.loss, self._lr = loss.to(spec.device), lr
         with naming("bonus"):
             self._bonus = RNDBonus(self.loss, **bonus)
