@@ -83,6 +83,27 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
         one.close(), other.close()
 
 
+@pytest.mark.slow
+def test_the_pass_can_be_traced_as_one_graph():
+    normalized = ("learn.sac.normalize_observations=true", "actor.hidden=[16,16]")
+    stages = [method_stage("sac", f"seed={seed}", *normalized) for seed in SEEDS]
+    for stage in stages:
+        fill(stage)
+        stage.close()
+    batches = [stage.sample() for stage in stages]
+    group = SideBySide([stage.learner for stage in stages])
+    inputs = stacked(batches, draws(group, batches))
+    with torch.no_grad():  # each its own, also of what is no network
+        stages[1].learner.objective.sac.log_alpha += 1
+        stages[1].learner.objective.normalizer.mean += 1
+    expected, _ = group.gradients(inputs)
+    with torch._dynamo.config.patch(trace_autograd_ops=True):
+        traced = torch.compile(group.gradients, fullgraph=True, backend="eager")
+        found, _ = traced(inputs)
+    for one, other in zip(sum(expected, ()), sum(found, ()), strict=True):
+        torch.testing.assert_close(other, one)
+
+
 def test_finding_out_what_is_drawn_draws_nothing():
     stage = learn_stage()
     fill(stage)
