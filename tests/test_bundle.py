@@ -257,6 +257,17 @@ def test_a_decoder_that_is_not_finite_is_not_saved(fault, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_bundle_of_a_decoder_that_is_not_finite_is_refused(tmp_path, monkeypatch):
+    decoder = SynergyDecoder(2, 3)
+    with torch.no_grad():
+        next(decoder.parameters()).view(-1)[0] = float("nan")
+    with monkeypatch.context() as patch:  # releases before saved it
+        patch.setattr("torchrl_etl.synergies.bundle._not_finite", lambda state: None)
+        save_bundle(decoder, tmp_path / "own", task="toy", actuators=["a", "b", "c"])
+    with pytest.raises(BundleError, match="not finite: its training diverged before it was saved"):
+        load_bundle(tmp_path / "own")
+
+
 def test_a_bundle_of_format_1_loads_and_says_that_it_cannot_encode(bundle):
     new = load_bundle(bundle)[0]
     state = safetensors.torch.load_file(bundle / "synergies.safetensors")

@@ -6,6 +6,7 @@ import difflib
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -167,8 +168,10 @@ def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
 
 
 def quiet_torchrl() -> None:
-    """Keep TorchRL's storage notices out of the progress bar."""
+    """Keep out of the progress bar what libraries tell their developers; a warning is one line."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    warnings.simplefilter("ignore", FutureWarning)
+    warnings.formatwarning = lambda message, *place, **source: f"Warning: {message}\n"
 
 
 def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -100,12 +100,11 @@ def save_bundle(
     if encoder is not None:
         state |= {f"{_ENCODER}{key}": value for key, value in encoder.state_dict().items()}
         num_components = encoder.num_components if num_components is None else num_components
-    for key, value in state.items():
-        if not value.isfinite().all():
-            raise BundleError(
-                f"{key} of the decoder is not finite, so it has no synergies to save; its training "
-                "diverged: lower the learning rate or look for NaN in the actions it was fitted to."
-            )
+    if (bad := _not_finite(state)) is not None:
+        raise BundleError(
+            f"{bad} of the decoder is not finite, so it has no synergies to save; its training "
+            "diverged: lower the learning rate or look for NaN in the actions it was fitted to."
+        )
     tensors = safetensors.torch.save(
         {key: value.detach().cpu().clone() for key, value in state.items()}
     )
@@ -191,6 +190,11 @@ def load_bundle(
             f"{_TENSORS} in {str(folder)!r} is not a safetensors file ({error}); write bundles "
             "with save_bundle."
         ) from error
+    if (bad := _not_finite(state)) is not None:
+        raise BundleError(
+            f"{bad} of the decoder in {str(folder)!r} is not finite: its training diverged before "
+            "it was saved; explore again, or take another bundle."
+        )
     config = dict(info.config) if residual is None else {**info.config, "residual": residual}
     try:
         # The weights drawn here are overwritten at once: do not let them advance the global seed.
@@ -245,6 +249,11 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         names = (_TENSORS, DESCRIPTION)
         replace_folder(target, {name: (folder / name).read_bytes() for name in names})
     return target
+
+
+def _not_finite(state: Mapping[str, torch.Tensor]) -> str | None:
+    """The first entry that holds NaN or infinity."""
+    return next((key for key, value in state.items() if not value.isfinite().all()), None)
 
 
 def _plain(value: Any, where: str) -> Any:
