@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
+from torchrl.envs import StepCounter
 
+from tests.configs import tiny
 from tests.stages import explorer
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.exploration import Exploration
+from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import HeldNoise
+
+
+class Counted(Exploration):
+    """One of a user's own, whose transform does not say what it does on arrays."""
+
+    keep = ("step_count",)
+
+    def __init__(self, spec, **options):
+        super().__init__(spec)
+
+    def reset_transforms(self):
+        return (StepCounter(),)
 
 
 def test_noise_of_the_actor_that_is_configured_for_stage_1_collects():
@@ -24,4 +42,15 @@ def test_synergies_see_actions_for_the_directions_that_the_exploration_relabels(
     seen = found.actions()
     torch.testing.assert_close(seen, found.shown(relabelled)["action"])
     assert not torch.allclose(seen, found.shown(rows)["action"])
+    found.stage.close()
+
+
+def test_a_transform_that_the_fast_collector_cannot_take_is_collected_with_torchrls():
+    config = tiny("run_dir=unused")
+    config.exploration.kind = f"{__name__}:Counted"
+    with pytest.warns(UserWarning, match="since StepCounter has no array_step and array_reset"):
+        found = Explorer(Experiment(config).context)
+    found.stage.restart_collection()
+    batch = found.stage.collect().reshape(4, 8)  # of 4 simulators
+    assert (batch["step_count"].squeeze(-1) == torch.arange(8)).all()
     found.stage.close()

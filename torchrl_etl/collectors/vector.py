@@ -25,11 +25,11 @@ from torchrl.envs import (
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.collectors.policy_on_arrays import Arrays, PolicyOnArrays
-from torchrl_etl.transforms import DirectionPrimer, SynergyAction
+from torchrl_etl.transforms import SynergyAction
 
 __all__ = ["VectorCollector"]
 
-_KNOWN = (RewardSum, InitTracker, DirectionPrimer, SynergyAction)
+_KNOWN = (RewardSum, InitTracker, SynergyAction)
 
 
 class VectorCollector(Collector):
@@ -37,10 +37,14 @@ class VectorCollector(Collector):
 
     The environment is an ordinary one: :func:`~torchrl_etl.envs.make_env` with ``num_envs`` above
     one, under any of ``RewardSum``, ``InitTracker``,
-    :class:`~torchrl_etl.transforms.DirectionPrimer` and
-    :class:`~torchrl_etl.transforms.SynergyAction`. TorchRL steps it through specs, clones and
-    containers that cost more than a hand's physics; this rollout does the same arithmetic on
-    arrays and fills one tensordict at the end. Transitions are bit by bit those of ``Collector``.
+    :class:`~torchrl_etl.transforms.SynergyAction` and transforms that say on arrays what they do,
+    as :class:`~torchrl_etl.transforms.DirectionPrimer` does in ``array_step(now, after)``, which
+    writes what a step leaves below ``"next"``, and in ``array_reset(now, fresh, done)``, which
+    writes the root that the next step starts from, where episodes ended.
+
+    TorchRL steps it through specs, clones and containers that cost more than a hand's physics; this
+    rollout does the same arithmetic on arrays and fills one tensordict at the end. Transitions are
+    bit by bit those of ``Collector``.
 
     It keeps random numbers of its own, begun anew by :meth:`set_seed`. What it collects depends on
     the seed and the weights alone: not on what else runs in the process, nor on which process
@@ -84,9 +88,15 @@ class VectorCollector(Collector):
         self._simulators, known = _take_apart(self.env)
         self._reward_sum: RewardSum | None = known.get(RewardSum)
         self._init_tracker: InitTracker | None = known.get(InitTracker)
-        self._primer: DirectionPrimer | None = known.get(DirectionPrimer)
         self._synergy_action: SynergyAction | None = known.get(SynergyAction)
+        self._on_arrays = [part for kind, part in known.items() if kind not in _KNOWN]
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
+
+    @staticmethod
+    def takes(transform: Transform) -> bool:
+        """Whether an environment may have this transform."""
+        offers = hasattr(transform, "array_step") and hasattr(transform, "array_reset")
+        return offers or type(transform) in _KNOWN
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the simulators and the collector's own random numbers."""
@@ -162,9 +172,8 @@ class VectorCollector(Collector):
             after[key] = now[key] + after["reward"]
         if self._init_tracker is not None:
             after[self._init_tracker.out_keys[0]] = np.zeros_like(after["done"])
-        if self._primer is not None:
-            key = self._primer.out_keys[0]
-            after[key] = now[key]
+        for transform in self._on_arrays:
+            transform.array_step(now, after)
         return written, after
 
     def _restart(self, now: Arrays, done: np.ndarray) -> Arrays:
@@ -177,10 +186,8 @@ class VectorCollector(Collector):
             fresh[key] = np.where(done[:, None], np.float32(0), now[key])
         if self._init_tracker is not None:
             fresh[self._init_tracker.out_keys[0]] = done[:, None]
-        if self._primer is not None:
-            key = self._primer.out_keys[0]
-            drawn = self._primer.draw(self.env.batch_size).numpy()  # for all, as in a plain reset
-            fresh[key] = np.where(done[:, None], drawn, now[key])
+        for transform in self._on_arrays:
+            transform.array_reset(now, fresh, done)
         if self._synergy_action is not None:
             key = self._synergy_action.executed_key
             rest = self._synergy_action.rest(self.env.batch_size).numpy()
@@ -201,12 +208,13 @@ def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, dict[type[Transform], Tran
     while isinstance(env, TransformedEnv):
         transforms += list(getattr(env.transform, "transforms", [env.transform]))
         env = env.base_env
-    foreign = [transform for transform in transforms if type(transform) not in _KNOWN]
+    foreign = [transform for transform in transforms if not VectorCollector.takes(transform)]
     if foreign or not isinstance(env, GymWrapper) or not isinstance(env._env, SyncVectorEnv):
         what = type(foreign[0]).__name__ if foreign else f"{type(env).__name__} of one simulator"
         raise ValueError(
             "VectorCollector knows make_env(..., num_envs=2 or more) under "
-            f"{', '.join(kind.__name__ for kind in _KNOWN)}, but the environment has a {what}; use "
+            f"{', '.join(kind.__name__ for kind in _KNOWN)} and transforms with array_step and "
+            f"array_reset, but the environment has a {what}; use "
             "torchrl.collectors.Collector for it."
         )
     return env._env, {type(transform): transform for transform in transforms}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -126,7 +127,15 @@ class Context:
         """
         collector = self.options("collector")
         num_envs = collector.pop("num_envs")
-        collector["collector_class"] = VectorCollector if num_envs > 1 else Collector
+        slow = [type(each).__name__ for each in env_transforms if not VectorCollector.takes(each)]
+        if num_envs > 1 and slow:
+            warnings.warn(
+                f"Frames come through TorchRL's Collector, which is several times slower, since "
+                f"{', '.join(slow)} has no array_step and array_reset (see VectorCollector).",
+                stacklevel=2,
+            )
+        fast = num_envs > 1 and not slow
+        collector["collector_class"] = VectorCollector if fast else Collector
         collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
         other = {"goal": None, "success_key": None} if task else {}  # what it says itself
         make_env = partial(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
@@ -170,6 +171,19 @@ class DirectionPrimer(TensorDictPrimer):
         fresh = self._reset_func(tensordict, tensordict_reset).get(key)
         reset = expand_as_right(group_reset(self.parent, tensordict, key), fresh)
         return tensordict_reset.set(key, torch.where(reset, fresh, present))
+
+    def array_step(self, now: dict[NestedKey, Any], after: dict[NestedKey, Any]) -> None:
+        """See :class:`~torchrl_etl.collectors.VectorCollector`."""
+        (key,) = self.out_keys
+        after[key] = now[key]
+
+    def array_reset(
+        self, now: dict[NestedKey, Any], fresh: dict[NestedKey, Any], done: np.ndarray
+    ) -> None:
+        """See :class:`~torchrl_etl.collectors.VectorCollector`."""
+        (key,) = self.out_keys
+        drawn = self.draw(torch.Size(done.shape)).numpy()  # for all, as in a plain reset
+        fresh[key] = np.where(done[:, None], drawn, now[key])
 
     def __repr__(self) -> str:
         return (
