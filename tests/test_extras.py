@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, packages_distributions, req
 from pathlib import Path
 
 import torchrl_etl
+from torchrl_etl.training import run_folder
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -125,3 +126,9 @@ def test_every_extra_that_the_code_names_exists_and_all_of_them_are_in_all():
     (every,) = extras["all"]
     listed = set(re.search(r"\[(.*)\]", every)[1].split(","))
     assert listed == set(extras) - {"all", "dev", "slurm"}
+
+
+def test_facts_of_a_run_leave_out_packages_that_are_not_installed(monkeypatch):
+    monkeypatch.setattr(run_folder, "_PACKAGES", ("numpy", "not-installed"))
+    found = run_folder.facts()
+    assert found["numpy"] and "not-installed" not in found

@@ -11,11 +11,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
-
 from torchrl_etl.checks import check_choice
+from torchrl_etl.extras import extra
 from torchrl_etl.training.config import RENAMED
 from torchrl_etl.training.resumed import check_prefix, parse_override
+
+with extra("recipes"):
+    from omegaconf import DictConfig, OmegaConf
 
 __all__ = [
     "check_overrides",
