@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import runpy
 import sys
 
@@ -17,6 +18,8 @@ def command(recipe: str, *arguments: str) -> int:
     """
     with MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [recipe, *arguments])
+        # Hydra sets logging up anew, on which absl closes the stream it wrote to: pytest's.
+        patch.setattr(logging, "shutdown", lambda *handlers: None)
         try:
             runpy.run_path(str(ROOT / "recipes" / recipe), run_name="__main__")
         except SystemExit as left:

@@ -13,12 +13,14 @@ import torch
 from torchrl.checkpoint import Checkpoint
 
 from torchrl_etl.checks import check_choice
-from torchrl_etl.envs import episode_length, resolve_task
+from torchrl_etl.envs import resolve_task
+from torchrl_etl.io import surviving_folder
 from torchrl_etl.methods import METHODS
+from torchrl_etl.synergies.bundle import load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.context import Context
-from torchrl_etl.training.evaluation import Evaluation, evaluate
+from torchrl_etl.training.evaluation import Evaluation, evaluate_task
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder, facts
 from torchrl_etl.training.stage import Stage
@@ -98,7 +100,7 @@ class Experiment:
         return summary
 
     def learned(self) -> Stage:
-        """The stage that learns the task, its policy that of the newest whole checkpoint.
+        """The stage that learns the task, policy and counters those of the newest checkpoint.
 
         Raises:
             FileNotFoundError: if the run has no such checkpoint.
@@ -110,20 +112,24 @@ class Experiment:
                 f"{self.folder.path} holds no whole checkpoint of stage 2; evaluate a run that has "
                 "begun to learn."
             )
-        Checkpoint(policy=stage.learner.policy).load(folder)
+        Checkpoint(policy=stage.learner.policy, progress=stage.progress).load(folder)
         return stage
+
+    def charged(self) -> int:
+        """Frames that went before learning: those that the run's own bundle tells of, if any."""
+        own = self.folder.synergies
+        if self.method.charged and surviving_folder(own).exists():
+            return load_bundle(own)[1].facts.get("frames", self.method.charged)
+        return self.method.charged
 
     def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
         """Evaluates the stage's present policy on the evaluation seeds."""
-        steps = self.config.env_kwargs.get("max_episode_steps")
         return partial(
-            evaluate,
+            evaluate_task,
             stage.learner.policy,
             self.context.make_env(),
-            solved_steps=self.task.solved_steps,
+            self.context.task,
             episodes=self.config.evaluation.episodes,
-            max_steps=steps or episode_length(self.config.env, self.config.goal) or 1000,
-            action_repeat=self.config.action_repeat,
         )
 
     def _learn(self, stop: StopOnSignal) -> Work[dict[str, Any]]:

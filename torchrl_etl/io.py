@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 __all__ = [
+    "as_json",
     "flush_folder",
     "replace_folder",
     "require_room",
@@ -92,6 +95,26 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         os.fsync(file.fileno())
     os.replace(scratch, path)
     flush_folder(path.parent)
+
+
+def as_json(content: Any) -> str:
+    """JSON text with a line for each entry.
+
+    JSON knows no NaN (the interval of a single episode, say); null stands for it.
+
+    Examples:
+        >>> as_json({"low": float("nan")})
+        '{\\n  "low": null\\n}\\n'
+    """
+    return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def flush_folder(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.objective import NORMALIZED, Objective
-from torchrl_etl.learners.sac import SACLearner, entropy_target
+from torchrl_etl.learners.sac import SACLearner, entropy_target, from_observation
 from torchrl_etl.learners.side_by_side import SideBySide
 from torchrl_etl.learners.term import Term
 
@@ -14,4 +14,5 @@ __all__ = [
     "Term",
     "build_learner",
     "entropy_target",
+    "from_observation",
 ]

@@ -28,7 +28,7 @@ from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap, normalize_rows
 from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss, SynergySACLoss
 
-__all__ = ["SACLearner", "entropy_target"]
+__all__ = ["SACLearner", "entropy_target", "from_observation"]
 
 
 class SACLearner:
@@ -146,8 +146,9 @@ class SACLearner:
         self.targets = [FusedSoftUpdate(sac, tau=tau)]
         self.targets += [term.target for term in terms if term.target is not None]
         self.ema = AveragedModel(actor, multi_avg_fn=warmed_up_ema(ema_decay))
-        self.behavior = self._from_observation(actor if behavior is None else behavior, decoder)
-        self.policy = self._from_observation(self.ema.module, decoder)
+        acting = actor if behavior is None else behavior
+        self.behavior = from_observation(acting, normalizer, decoder)
+        self.policy = from_observation(self.ema.module, normalizer, decoder)
         self.actor, self.decoder = actor, decoder
         self.unit_rows = list(linear_weights(sac)) if unit_rows else []
         normalize_rows(self.unit_rows)
@@ -230,14 +231,15 @@ class SACLearner:
             "optimizer": self.optimizer,
         }
 
-    def _from_observation(
-        self, actor: TensorDictModuleBase, decoder: SynergyMap | None
-    ) -> TensorDictModuleBase:
-        """The actor as it acts in an environment: on raw observations, with decoded actions."""
-        before, after = [], [] if decoder is None else [decoder]
-        if self.objective.normalizer is not None:
-            before = [TensorDictModule(self.objective.normalizer, ["observation"], [NORMALIZED])]
-        return TensorDictSequential(*before, actor, *after) if before or after else actor
+
+def from_observation(
+    actor: TensorDictModuleBase, normalizer: RunningNorm | None, decoder: SynergyMap | None
+) -> TensorDictModuleBase:
+    """An actor as it acts in an environment: on raw observations, with decoded actions."""
+    before, after = [], [] if decoder is None else [decoder]
+    if normalizer is not None:
+        before = [TensorDictModule(normalizer, ["observation"], [NORMALIZED])]
+    return TensorDictSequential(*before, actor, *after) if before or after else actor
 
 
 def entropy_target(action_spec: Bounded, action_std: float | None) -> float | Literal["auto"]:

@@ -72,6 +72,9 @@ class DynSyn(Method):
             return json.loads(self.file.read_text(encoding="utf-8"))
         return list(range(len(self.context.spec.actuators)))  # a placeholder
 
+    def actor(self) -> dict[str, Any]:
+        return {"kind": "dynsyn", "groups": self.groups}
+
     def stage(self) -> Stage:
         groups, deviation = self.groups, dict(self.actor_options)
         if "start_share" in deviation:

@@ -9,6 +9,7 @@ import safetensors.torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_etl import zoo
 from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real, naming
 from torchrl_etl.envs import resolve_task
@@ -48,6 +49,12 @@ def default_num_synergies(actuators: int) -> int:
     return min(MOST_SYNERGIES, max(1, actuators // 2))
 
 
+def bundle_path(given: str) -> Path:
+    """Where the synergies are that ``synergies=`` names: a path, or an entry as ``zoo:NAME``."""
+    entry = given.removeprefix("zoo:")
+    return (Path(given).expanduser() if entry == given else zoo.synergies(entry)).resolve()
+
+
 class ETL(Method):
     """Algorithm 1: explore and condense, or take a bundle; then SAC on synergy coefficients.
 
@@ -79,7 +86,7 @@ class ETL(Method):
             )
         if self.given:
             # The absolute path stands in the run's configuration.
-            config.synergies.bundle = str(Path(config.synergies.bundle).expanduser().resolve())
+            config.synergies.bundle = str(bundle_path(config.synergies.bundle))
             _, info = load_bundle(self.bundle)
             config.num_synergies = info.num_synergies
             space = context.spec

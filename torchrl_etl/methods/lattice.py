@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from torchrl_etl.baselines import LatticeNoise, make_lattice_actor
 from torchrl_etl.methods.method import Method
@@ -20,9 +21,13 @@ class Lattice(Method):
 
     takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
 
+    def actor(self) -> dict[str, Any]:
+        return {"kind": "lattice", **{k: v for k, v in self.options.items() if k != "freq"}}
+
     def stage(self) -> Stage:
-        options = dict(self.options)
-        freq, held = options.pop("freq"), options["state_dependent"]
+        options = self.actor()
+        del options["kind"]
+        freq, held = self.options["freq"], options["state_dependent"]
         self.context.seed_everything("learn")
         learner = self.context.learner(
             make_actor=partial(make_lattice_actor, **options),

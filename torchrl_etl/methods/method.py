@@ -72,6 +72,10 @@ class Method:
     def begin(self, stage: Stage) -> None:
         """Give the stage what it has before its first frame; a checkpoint replaces it."""
 
+    def actor(self) -> dict[str, Any]:
+        """The actor's kind, and arguments of its own, for :func:`~torchrl_etl.zoo.make_policy`."""
+        return {"kind": "gaussian"}
+
     def check(self) -> None:
         """Build every part once, so that each objects to its arguments before the first frame."""
         self.stage()

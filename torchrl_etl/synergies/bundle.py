@@ -33,10 +33,12 @@ from torchrl_etl.synergies.bundle_info import (
     some,
 )
 
-__all__ = ["copy_bundle", "load_bundle", "save_bundle"]
+__all__ = ["BUNDLE_FILES", "bundle_files", "copy_bundle", "load_bundle", "save_bundle"]
 
 _ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
+BUNDLE_FILES = (_TENSORS, DESCRIPTION)
+"""What a bundle consists of."""
 
 
 def save_bundle(
@@ -127,7 +129,7 @@ def save_bundle(
     folder = Path(path).resolve()
     if folder.exists() and (
         not folder.is_dir()
-        or (others := {file.name for file in folder.iterdir()} - {_TENSORS, DESCRIPTION})
+        or (others := {file.name for file in folder.iterdir()} - {*BUNDLE_FILES})
     ):
         held = f"holds {some(sorted(others))}" if folder.is_dir() else "is a file"
         raise BundleError(
@@ -243,12 +245,27 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         >>> info.task
         'toy'
     """
-    load_bundle(source)
-    folder, target = _find_folder(Path(source)), Path(target).resolve()
-    if folder != target:
-        names = (_TENSORS, DESCRIPTION)
-        replace_folder(target, {name: (folder / name).read_bytes() for name in names})
+    files, target = bundle_files(source), Path(target).resolve()
+    if _find_folder(Path(source)) != target:
+        replace_folder(target, files)
     return target
+
+
+def bundle_files(path: str | os.PathLike[str]) -> dict[str, bytes]:
+    """The files of a whole bundle, to be put somewhere else.
+
+    Args:
+        path (path-like): the bundle's folder, or a run folder.
+
+    Returns:
+        dict: contents by name.
+
+    Raises:
+        BundleError: if there is no bundle, or it is damaged.
+    """
+    load_bundle(path)
+    folder = _find_folder(Path(path))
+    return {name: (folder / name).read_bytes() for name in BUNDLE_FILES}
 
 
 def _not_finite(state: Mapping[str, torch.Tensor]) -> str | None:

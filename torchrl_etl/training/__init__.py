@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_etl.training.config import validate
 from torchrl_etl.training.context import Context
-from torchrl_etl.training.evaluation import Evaluation, evaluate
+from torchrl_etl.training.evaluation import Evaluation, evaluate, evaluate_task
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.sweep import Run, Sweep
@@ -25,6 +25,7 @@ __all__ = [
     "alone",
     "check_video_size",
     "evaluate",
+    "evaluate_task",
     "record_episodes",
     "resumed_config",
     "together",

@@ -64,11 +64,16 @@ class Context:
 
     def make_env(self, **options: Any) -> EnvBase:
         """One simulator of the task."""
-        return make_env(self.config.env, device=self.device, **{**self.variant, **options})
+        return make_env(device=self.device, **{**self.task, **options})
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """Arguments of :func:`~torchrl_etl.envs.make_env` that name the task."""
+        return {"name": self.config.env, **self.variant}
 
     @property
     def variant(self) -> dict[str, Any]:
-        """Arguments of :func:`~torchrl_etl.envs.make_env` that make the task what it is."""
+        """Those of them that make the task what it is."""
         return {
             "goal": self.config.goal,
             "action_repeat": self.config.action_repeat,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_etl.analysis import Interval, interval, success_interval
+from torchrl_etl.envs import episode_length, resolve_task
 
-__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate"]
+__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate", "evaluate_task"]
 
 EVALUATION_SEED = 10_000_000
 """Seed of the first evaluation episode; training seeds start at 2**30."""
@@ -114,3 +116,35 @@ def evaluate(
                 enough = solved_steps is not None and solved[-1] >= solved_steps
                 successes.append(flags[-1].item() if solved_steps is None else enough)
     return Evaluation(returns, lengths, solved or None, max_steps, successes or None)
+
+
+def evaluate_task(
+    policy: TensorDictModuleBase, env: EnvBase, task: Mapping[str, Any], *, episodes: int
+) -> Evaluation:
+    """Evaluate a policy on a task as every run does: its episodes' length, its idea of success.
+
+    Args:
+        policy (TensorDictModuleBase): the policy.
+        env (EnvBase): the task's environment.
+        task (mapping): what it was built with: ``name``, ``goal``, ``action_repeat`` and
+            ``env_kwargs`` of :func:`~torchrl_etl.envs.make_env`.
+
+    Keyword Args:
+        episodes (int): number of episodes.
+
+    Examples:
+        >>> from torchrl_etl import zoo
+        >>> policy, env = zoo.load("overactuated")
+        >>> len(evaluate_task(policy, env, zoo.read_card("overactuated").task, episodes=2).returns)
+        2
+    """
+    name, goal = task["name"], task.get("goal")
+    steps = (task.get("env_kwargs") or {}).get("max_episode_steps")
+    return evaluate(
+        policy,
+        env,
+        episodes=episodes,
+        max_steps=steps or episode_length(name, goal) or 1000,
+        action_repeat=task.get("action_repeat", 1),
+        solved_steps=resolve_task(name, goal).solved_steps,
+    )

@@ -23,6 +23,8 @@ __all__ = ["check_prefix", "parse_override", "resumed_config"]
 
 # Every release had these, and the last of them ends the file: one that was cut short lacks it.
 _SECTIONS = ("explore", "learn", "checkpoint", "collector", "method")
+# Sections whose options are those of the kind that they name.
+_OF_A_KIND = ("exploration", "synergies")
 # Where settings of other libraries go, by names that are not ours.
 _OPEN_SECTIONS = ("logger_kwargs", "env_kwargs", "ray", "distributed")
 
@@ -133,6 +135,8 @@ def _missing(config: DictConfig, defaults: DictConfig) -> Iterator[tuple[str, An
         for key, value in want.items():
             if key not in have:
                 yield f"{prefix}{key}", value
+            elif prefix + key in _OF_A_KIND and have[key].get("kind") != value.get("kind"):
+                continue  # another kind's options are none of it
             elif isinstance(value, dict) and isinstance(have[key], dict):
                 yield from walk(have[key], value, f"{prefix}{key}.")
 

@@ -6,7 +6,6 @@ import csv
 import io
 import itertools
 import json
-import math
 import os
 import platform
 import subprocess
@@ -20,7 +19,7 @@ from filelock import FileLock, Timeout
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.extras import extra
-from torchrl_etl.io import write_atomically
+from torchrl_etl.io import as_json, write_atomically
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -82,7 +81,7 @@ class RunFolder:
                 "run_dir or mend its permissions."
             ) from error
         # One entry a start: a run may be resumed on another machine or commit.
-        self.write_json("versions.json", [*self._read_json("versions.json", []), facts()])
+        self.write_json("versions.json", [*self.versions, facts()])
 
     def close(self) -> None:
         """Let other processes have the folder."""
@@ -101,12 +100,16 @@ class RunFolder:
 
     def write_json(self, name: str, content: Any) -> Path:
         """Write a JSON file atomically; returns its path."""
-        text = json.dumps(_finite(content), indent=2, allow_nan=False)
-        write_atomically(self.path / name, text + "\n")
+        write_atomically(self.path / name, as_json(content))
         return self.path / name
 
     def checkpoints(self, stage: str) -> Path:
         return self.path / "checkpoints" / stage
+
+    @property
+    def versions(self) -> list[dict[str, Any]]:
+        """What :func:`facts` gave at each start."""
+        return self._read_json("versions.json", [])
 
     @property
     def saved(self) -> dict[str, int]:
@@ -239,15 +242,6 @@ def _is_installed(package: str) -> bool:
         return bool(version(package))
     except PackageNotFoundError:
         return False
-
-
-def _finite(content: Any) -> Any:
-    """JSON knows no NaN (the interval of a single episode, say); null stands for it."""
-    if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def _commit() -> str | None:

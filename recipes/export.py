@@ -1,0 +1,60 @@
+"""Make an entry of the zoo out of a run: weights, card and synergy bundle in a small folder.
+
+    python recipes/export.py run=runs/NAME
+    python recipes/evaluate.py zoo=zoo/myoHandPenTwirl
+
+In Python, zoo.load("zoo/myoHandPenTwirl") gives policy and environment. These are all settings,
+with their defaults:
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import hydra
+from omegaconf import DictConfig
+
+from torchrl_etl.checks import check_choice, check_integer
+from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
+from torchrl_etl.envs import SimulationError, resolve_task
+from torchrl_etl.export import export_run
+from torchrl_etl.synergies.bundle import copy_bundle
+from torchrl_etl.training import resumed_config
+
+CONF = Path(__file__).parent / "conf"
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="export")
+def main(config: DictConfig) -> None:
+    quiet_torchrl()
+    compose = partial(hydra.compose, "config")
+    with one_sentence(ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error):
+        if config.run is None:
+            raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
+        check_choice("part", config.part, ("all", "synergies"))
+        check_integer(1, episodes=config.episodes)
+        run = Path(config.run)
+        trained = resumed_config(run, defaults=compose())
+        task = resolve_task(trained.env, trained.goal)
+        name = config.name or task.name.rpartition("/")[2] + "-random" * (task.goal == "random")
+        target = Path(config.out or f"zoo/{name}").expanduser()
+        if config.part == "synergies":
+            print(f"Synergies of {trained.env}, for synergies=zoo:{copy_bundle(run, target)}")
+            return
+        card = export_run(run, target, compose, episodes=config.episodes)
+    size = sum(path.stat().st_size for path in target.iterdir())
+    print(f"{trained.env}{task.goal_in_words}, {card.training['frames']:,} frames")
+    for key in ("return", "solved", "solved_time"):
+        if key in card.evaluation:
+            mean, low, high = card.evaluation[key].values()
+            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+    print(f"  {size / 1e6:.2f} MB in {target}; to load it: zoo.load({str(target)!r})")
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = quote_paths(sys.argv[1:], "run", "out")
+    check_overrides(CONF / "export.yaml", sys.argv[1:], __doc__)
+    main()

@@ -1,0 +1,279 @@
+"""Entries of the zoo: out of runs, whole or refused, and back as policies that do the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import shutil
+
+import pytest
+import safetensors.torch
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from tests.commands import command
+from tests.configs import CONF, tiny
+from tests.test_training_methods import BRIEFLY, ELBOW
+from torchrl_etl import zoo
+from torchrl_etl.command_line import translate
+from torchrl_etl.envs import make_env
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.export import command_of, describe_policy, export_run, rebuilt
+from torchrl_etl.synergies.bundle import load_bundle
+from torchrl_etl.training import evaluate_task, resumed_config
+from torchrl_etl.zoo import ZooError
+
+
+def composed(overrides=()):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished tiny run of both stages."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    Experiment(tiny(f"run_dir='{folder}'", "env=torchrl_etl/Overactuated-v0")).run()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(run):
+    """An entry of it."""
+    export_run(run, run.parent / "toy", composed, episodes=3)
+    return run.parent / "toy"
+
+
+@pytest.mark.parametrize("kind", ["synergies=pca", "exploration=metra"])
+def test_a_run_of_another_kind_than_the_default_is_read_as_it_was(kind, tmp_path):
+    made = Experiment(tiny(f"run_dir='{tmp_path}/run'", kind))
+    made.folder.open(resume=False)
+    made.folder.close()
+    read = resumed_config(made.folder.path, defaults=composed())
+    assert OmegaConf.to_container(read) == OmegaConf.to_container(made.config)
+
+
+@pytest.fixture
+def entry(exported, tmp_path):
+    """The same, to be damaged."""
+    return shutil.copytree(exported, tmp_path / "toy")
+
+
+def observations(size: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict({"observation": torch.randn(5, size, generator=generator)}, [5])
+
+
+@pytest.mark.parametrize("name", zoo.names())
+def test_every_entry_repeats_the_numbers_of_its_card(name):
+    if not (zoo.find(name) / "card.json").exists():
+        load_bundle(zoo.synergies(name))
+        return
+    policy, env = zoo.load(name)
+    card, again = zoo.read_card(name), 2
+    found = evaluate_task(policy, env, card.task, episodes=again)
+    told = card.evaluation["episodes"]
+    assert found.returns == pytest.approx(told["returns"][:again], rel=0.02)
+    assert found.successes == (told["successes"] and told["successes"][:again])
+    assert {"method", "frames", "seed", "commit", "versions", "command"} == card.training.keys()
+    assert "dirty" not in card.training["commit"]
+    for word in ("/tmp", "/home", "run_dir"):
+        assert word not in card.json
+
+
+def test_an_entry_holds_the_run_s_own_policy_and_bundle(run, exported):
+    card = zoo.read_card(exported)
+    assert (
+        card.training["frames"]
+        == json.loads((run / "summary.json").read_text())["learn"]["frames_charged"]
+    )
+    assert card.training["method"] == "etl" and card.training["versions"]["torch"]
+    own = Experiment(resumed_config(run), resume=run).learned().learner.policy
+    policy, env = zoo.load(exported)
+    rows = observations(6)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(policy(rows)["action"], own(rows)["action"])
+    again = evaluate_task(policy, env, card.task, episodes=3)
+    assert again.returns == card.evaluation["episodes"]["returns"]
+    assert card.evaluation["return"]["mean"] == again.mean_return.mean
+    found, kept = load_bundle(zoo.synergies(exported))[0], load_bundle(run)[0]
+    torch.testing.assert_close(found.state_dict(), kept.state_dict())
+    assert (
+        sorted(path.suffix for path in exported.iterdir())
+        == [".json", ".json"] + [".safetensors"] * 2
+    )
+
+
+def test_a_policy_acts_without_noise_unless_it_is_asked_for(exported):
+    policy, _ = zoo.load(exported)
+    rows = observations(6)
+    assert torch.equal(policy(rows.clone())["action"], policy(rows.clone())["action"])
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert not torch.equal(policy(rows.clone())["action"], policy(rows.clone())["action"])
+
+
+def test_loading_leaves_the_global_random_numbers_alone(exported):
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    zoo.load(exported)
+    assert torch.equal(torch.rand(3), expected)
+
+
+@pytest.mark.parametrize("method", ["sac", "dynsyn", "lattice", "lattice_plain", "sar", "eme"])
+def test_the_policy_of_every_method_is_built_again(method):
+    experiment = Experiment(
+        tiny(ELBOW, f"method={method}", "run_dir=unused", *BRIEFLY.get(method, []))
+    )
+    learner = experiment.method.stage().learner
+    described = json.loads(json.dumps(describe_policy(experiment, learner)))
+    rows = observations(described["observation_dim"])
+    policy = rebuilt(learner.policy, described)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = learner.policy(rows.clone())["action"]
+        torch.testing.assert_close(policy(rows.clone())["action"], expected)
+
+
+def test_a_method_that_does_not_tell_of_its_actor_is_one_sentence(monkeypatch):
+    experiment = Experiment(tiny(ELBOW, "method=lattice", "run_dir=unused"))
+    learner = experiment.method.stage().learner
+    monkeypatch.setattr(experiment.method, "actor", lambda: {"kind": "gaussian"})
+    with pytest.raises(ValueError, match="its method must say which actor it has"):
+        rebuilt(learner.policy, describe_policy(experiment, learner))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["method=sac", "goal=random", "frames=700", "learn.sac.lr=1e-3", "seed=3"],
+        ["method=lattice", "action_repeat=2", "critic.hidden=[16]", "collector=process"],
+        ["synergies=nmf", "exploration=metra", "+env_kwargs.max_episode_steps=9", "faithful=paper"],
+    ],
+)
+def test_the_command_on_a_card_makes_the_same_configuration(overrides):
+    made = tiny("run_dir=unused", *overrides)
+    told = shlex.split(command_of(made, composed, "toy"))
+    assert told[:2] == ["python", "recipes/etl_sac.py"]
+    again = composed(translate(told[2:], CONF))
+    assert place_aside(again) == place_aside(made)
+
+
+def place_aside(config) -> dict:
+    """What makes a run what it is, wherever it is."""
+    plain = OmegaConf.to_container(config)
+    for key in (
+        "run_dir",
+        "seeds",
+        "progress",
+        "pictures",
+        "threads",
+        "log",
+        "log_every",
+        "vaf_curve",
+    ):
+        del plain[key]
+    if plain["frames"] is not None:
+        del plain["learn"]["frames"]
+    return plain
+
+
+def test_given_synergies_are_those_of_the_entry(exported):
+    made = tiny("run_dir=unused", f"synergies=zoo:{exported}")
+    assert Experiment(made).config.num_synergies == 2
+    assert "synergies=zoo:toy" in command_of(made, composed, "toy")
+    assert str(exported) not in command_of(made, composed, "toy")
+
+
+def rewrite(entry, **changes):
+    card = json.loads((entry / "card.json").read_text())
+    (entry / "card.json").write_text(json.dumps({**card, **changes}))
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def swap_weights(entry, value=0.0):
+    weights = safetensors.torch.save({"weight": torch.full((2,), value)})
+    (entry / "policy.safetensors").write_bytes(weights)
+    rewrite(entry, sha256=hashlib.sha256(weights).hexdigest())
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda entry: cut(entry / "policy.safetensors"), "SHA-256 is not the one in card.json"),
+        (lambda entry: (entry / "policy.safetensors").unlink(), "cannot be read"),
+        (lambda entry: cut(entry / "card.json"), "is not JSON"),
+        (lambda entry: (entry / "card.json").write_text("[]"), "format_version None"),
+        (lambda entry: rewrite(entry, format_version=9), "format_version 9"),
+        (lambda entry: rewrite(entry, policy=[]), "not what belongs to 'policy'"),
+        (lambda entry: rewrite(entry, more=1), "not what belongs to 'more'"),
+        (lambda entry: rewrite(entry, policy={}), "describes no policy"),
+        (lambda entry: rewrite(entry, task={"name": "myoHand"}), "names no task"),
+        (lambda entry: rewrite(entry, actuators=["a"] * 16), "not the environment's 16"),
+        (lambda entry: rewrite(entry, task={"name": "antigravity:T-v0"}), "does not get to import"),
+        (swap_weights, "are not those of the policy"),
+        (lambda entry: swap_weights(entry, torch.nan), "weight of .* is not finite"),
+        (lambda entry: shutil.rmtree(entry), "The zoo has no"),
+        (lambda entry: (entry / "card.json").unlink(), "holds synergies alone"),
+    ],
+)
+def test_a_damaged_or_foreign_entry_is_one_sentence(damage, words, entry):
+    damage(entry)
+    with pytest.raises(ZooError, match=words) as caught:
+        zoo.load(entry)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_policy_is_refused_on_another_body(exported):
+    with pytest.raises(ZooError, match=r"reads 6 observations and the environment gives"):
+        zoo.load(exported, env=make_env("cheetah-run"))
+
+
+def test_an_entry_does_not_replace_what_is_none(run, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ZooError, match=r"holds 'thesis.tex'"):
+        export_run(run, tmp_path, composed, episodes=1)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command("export.py", f"run={run}", "name=toy", "episodes=2") == 0
+    assert "zoo.load('zoo/toy')" in capsys.readouterr().out
+    assert command("evaluate.py", "zoo=zoo/toy", "episodes=2") == 0
+    assert "as its card says, in each of 2 episodes" in capsys.readouterr().out
+    assert (tmp_path / "runs" / "zoo-toy" / "evaluation.json").is_file()
+    assert command("export.py", f"run={run}", "part=synergies", "out=hand") == 0
+    assert zoo.synergies("hand").name == "hand"
+    with pytest.raises(ZooError, match="synergies alone"):
+        zoo.load("hand")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "arguments", "words"),
+    [
+        ("export.py", [], "no run is named"),
+        ("export.py", ["run=nowhere"], "holds no run"),
+        ("export.py", ["run=explored"], "holds no whole checkpoint of stage 2"),
+        ("export.py", ["run=explored", "part=policy"], "part is 'policy'; choose one of"),
+        ("evaluate.py", ["zoo=overactuted"], "nearest: overactuated"),
+        ("evaluate.py", ["zoo=a", "run=b"], "a run and an entry are named"),
+        ("etl_sac.py", ["synergies=zoo:nowhere", "env=overactuated"], "The zoo has no 'nowhere'"),
+    ],
+)
+def test_what_cannot_be_exported_or_evaluated_is_one_sentence(
+    recipe, arguments, words, run, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "explored").mkdir()
+    shutil.copy(run / "config.yaml", tmp_path / "explored")
+    assert command(recipe, *arguments) != 0
+    assert words in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["explored"]

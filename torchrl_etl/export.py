@@ -1,0 +1,173 @@
+"""An entry of the zoo out of a run."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.extras import extra
+from torchrl_etl.io import surviving_folder
+from torchrl_etl.learners import SACLearner
+from torchrl_etl.training import evaluate_task, resumed_config
+from torchrl_etl.zoo import Card, describe_decoder, make_policy, save_entry
+
+with extra("recipes"):
+    from hydra.errors import HydraException
+    from omegaconf import DictConfig, OmegaConf
+
+__all__ = ["command_of", "describe_policy", "export_run", "rebuilt"]
+
+Compose = Callable[[Sequence[str]], DictConfig]
+
+_GROUPS = {
+    "method": "method.name",
+    "exploration": "exploration.kind",
+    "synergies": "synergies.kind",
+    "collector": "collector.kind",
+}
+"""Groups of the configuration, and the setting that says which file was chosen."""
+
+# Where a run was and what it showed: nothing of it is in a policy.
+_OF_THE_PLACE = ("run_dir", "resume", "log", "logger_kwargs", "log_every", "progress", "pictures")
+_OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed")
+
+
+def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50) -> Card:
+    """Evaluate the policy of a run and write it as an entry of the zoo.
+
+    The policy that is evaluated is the one that was built again from the card.
+
+    Args:
+        run (path): the run folder.
+        target (path): the entry's folder; its name is the entry's.
+        compose (callable): a configuration from Hydra's overrides.
+
+    Keyword Args:
+        episodes (int): of the evaluation.
+
+    Returns:
+        Card: what is said of it.
+
+    Raises:
+        FileNotFoundError: if the run has not begun to learn.
+        ValueError: if there is no run, it is of a release with other names, or its policy is not
+            one that an entry can hold.
+    """
+    config = resumed_config(run, defaults=compose([]))
+    experiment = Experiment(config, resume=run)
+    stage = experiment.learned()
+    learner, context = stage.learner, experiment.context
+    described = describe_policy(experiment, learner)
+    policy = rebuilt(learner.policy, described)
+    result = evaluate_task(policy, context.make_env(), context.task, episodes=episodes)
+    starts = experiment.folder.versions or [{}]
+    card = Card(
+        task={**context.task, "goal": experiment.task.goal},
+        actuators=list(context.spec.actuators),
+        policy=described,
+        training={
+            "method": config.method.name,
+            "frames": experiment.charged() + stage.frames,
+            "seed": config.seed,
+            "commit": starts[-1].pop("commit", None),
+            "versions": starts[-1],
+            "command": command_of(config, compose, target.name),
+        },
+        evaluation=result.summary(),
+    )
+    has_bundle = surviving_folder(experiment.folder.synergies).exists()
+    save_entry(target, policy, card, bundle=experiment.folder.synergies if has_bundle else None)
+    return card
+
+
+def describe_policy(experiment: Experiment, learner: SACLearner) -> dict[str, Any]:
+    """Arguments of :func:`~torchrl_etl.zoo.make_policy` for the policy of a run's learner.
+
+    Raises:
+        ValueError: if an entry cannot hold its decoder.
+    """
+    spec, options = experiment.context.spec, experiment.context.options("learn")["actor"]
+    return {
+        "observation_dim": spec.observation_dim,
+        "low": spec.low.tolist(),
+        "high": spec.high.tolist(),
+        "actor": {**experiment.method.actor(), **options},
+        "decoder": describe_decoder(learner.decoder),
+        "normalize_observations": learner.objective.normalizer is not None,
+    }
+
+
+def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDictModuleBase:
+    """The policy that the description and the weights of another make.
+
+    Raises:
+        ValueError: if the description is not of that policy.
+    """
+    again = make_policy(**described)
+    try:
+        again.load_state_dict(policy.state_dict())
+    except RuntimeError as error:
+        raise ValueError(
+            "The policy of this run is not one that the zoo can build again "
+            f"({' '.join(str(error).split())[:200]}); its method must say which actor it has."
+        ) from error
+    return again.to(torch.device("cpu"))
+
+
+def command_of(config: DictConfig, compose: Compose, name: str) -> str:
+    """The command whose configuration is this one, but for what concerns place and display.
+
+    Args:
+        config (DictConfig): of a run.
+        compose (callable): a configuration from Hydra's overrides.
+        name (str): of the entry, whose synergies stand for those that the run was given.
+    """
+    chosen: list[str] = []
+    for group, key in _GROUPS.items():
+        kind = OmegaConf.select(config, key)
+        if OmegaConf.select(compose(chosen), key) == kind:
+            continue
+        with suppress(HydraException):  # of one's own, in a file that is not here
+            compose([*chosen, f"{group}={kind}"])
+            chosen.append(f"{group}={kind}")
+    base, mine = (OmegaConf.to_container(of) for of in (compose(chosen), config))
+    words = [f"env={config.env}", *chosen]
+    if config.synergies.bundle is not None:
+        words.append(f"synergies=zoo:{name}")
+    shared = "learn.frames" if config.frames is not None else None  # follows from frames
+    for key, value in _differences(base, mine):
+        if key not in ("env", shared):
+            words.append(f"{key}={value}")
+    return shlex.join(["python", "recipes/etl_sac.py", *words])
+
+
+def _differences(base: dict, mine: dict, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Settings of ``mine`` that ``base`` has otherwise, as Hydra's overrides name them."""
+    for key, value in mine.items():
+        path = f"{prefix}{key}"
+        if path in _OF_THE_PLACE:
+            continue
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            yield from _differences(base[key], value, f"{path}.")
+        elif key not in base:
+            yield f"+{path}", _in_words(value)
+        elif base[key] != value:
+            yield path, _in_words(value)
+
+
+def _in_words(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    if isinstance(value, list):
+        return f"[{','.join(map(_in_words, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_in_words(item)}" for key, item in value.items()) + "}"
+    return str(value)

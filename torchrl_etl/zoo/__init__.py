@@ -1,0 +1,25 @@
+"""Trained policies and synergy bundles to begin from: two lines load one.
+
+>>> from torchrl_etl import zoo
+>>> policy, env = zoo.load("overactuated")
+>>> env.rollout(3, policy)["action"].shape
+torch.Size([3, 16])
+"""
+
+from torchrl_etl.zoo.card import Card, ZooError
+from torchrl_etl.zoo.entry import ENTRIES, find, load, names, read_card, save_entry, synergies
+from torchrl_etl.zoo.policy import describe_decoder, make_policy
+
+__all__ = [
+    "ENTRIES",
+    "Card",
+    "ZooError",
+    "describe_decoder",
+    "find",
+    "load",
+    "make_policy",
+    "names",
+    "read_card",
+    "save_entry",
+    "synergies",
+]

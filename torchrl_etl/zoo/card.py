@@ -1,0 +1,85 @@
+"""What is said of an entry of the zoo: ``card.json``."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from torchrl_etl.io import as_json
+
+__all__ = ["CARD", "WEIGHTS", "Card", "ZooError"]
+
+FORMAT_VERSION = 1
+CARD = "card.json"
+WEIGHTS = "policy.safetensors"
+
+
+class ZooError(ValueError):
+    """An entry of the zoo cannot be written, read or used; the message says why and what helps."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What ``card.json`` says.
+
+    Args:
+        task (dict): arguments of :func:`~torchrl_etl.envs.make_env`: ``name``, ``goal`` and so on.
+        actuators (list of str): names of the n actuators, in action order.
+        policy (dict): arguments of :func:`~torchrl_etl.zoo.make_policy`.
+        training (dict): ``method``, ``frames`` (all that were charged), ``seed``, ``commit``,
+            ``versions`` and the ``command``.
+        evaluation (dict): ``return``, ``solved`` and ``solved_time`` with 95 % intervals, where the
+            task defines them, and each episode's own numbers, as
+            :meth:`Evaluation.summary <torchrl_etl.training.Evaluation.summary>` has them.
+        sha256 (str): digest of the weights.
+        format_version (int): version of this layout.
+    """
+
+    task: dict[str, Any]
+    actuators: list[str]
+    policy: dict[str, Any]
+    training: dict[str, Any]
+    evaluation: dict[str, Any]
+    sha256: str = ""
+    format_version: int = field(default=FORMAT_VERSION)
+
+    @property
+    def json(self) -> str:
+        """The file's text; a list of numbers takes a line."""
+        lists = re.compile(r"\[[^][{}]*\]")
+        return lists.sub(lambda found: re.sub(r"\s*\n\s*", " ", found[0]), as_json(asdict(self)))
+
+    @classmethod
+    def read(cls, folder: Path) -> Card:
+        """The card in a folder.
+
+        Raises:
+            ZooError: if there is none that this release understands.
+        """
+        path = folder / CARD
+        try:
+            content = json.loads(path.read_bytes())
+        except OSError as error:
+            raise ZooError(
+                f"{path} cannot be read ({error.strerror}); copy the entry again."
+            ) from error
+        except ValueError as error:
+            raise ZooError(f"{path} is not JSON ({error}); copy the entry again.") from error
+        version = content.get("format_version") if isinstance(content, dict) else None
+        if version != FORMAT_VERSION:
+            raise ZooError(
+                f"{path} has format_version {version!r} where this torchrl_etl reads "
+                f"{FORMAT_VERSION}; load it with the release that wrote it."
+            )
+        known = {item.name: item.type for item in fields(cls)}
+        odd = sorted(known.keys() ^ content.keys()) or [
+            name
+            for name, value in content.items()
+            if type(value).__name__ != known[name].partition("[")[0]
+        ]
+        if odd:
+            raise ZooError(f"{path} has not what belongs to {odd[0]!r}; copy the entry again.")
+        return cls(**content)

@@ -1,0 +1,258 @@
+"""An entry of the zoo: a folder with a card, weights and, where there is one, a synergy bundle."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from torchrl_etl.checks import check_choice
+from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.io import replace_folder
+from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
+from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
+from torchrl_etl.zoo.policy import make_policy
+
+__all__ = ["ENTRIES", "find", "load", "names", "read_card", "save_entry", "synergies"]
+
+ENTRIES = Path(__file__).parent / "entries"
+"""The folder of the entries that come with torchrl_etl."""
+
+
+def names() -> list[str]:
+    """Names of the entries that come with torchrl_etl.
+
+    Examples:
+        >>> "overactuated" in names()
+        True
+    """
+    return sorted(path.name for path in ENTRIES.iterdir() if path.is_dir())
+
+
+def find(name: str | os.PathLike[str]) -> Path:
+    """The folder of an entry: one that comes with torchrl_etl, or any other by its path.
+
+    Raises:
+        ZooError: if there is none.
+
+    Examples:
+        >>> find("overactuted")
+        Traceback (most recent call last):
+        ...
+        torchrl_etl.zoo.card.ZooError: The zoo has no 'overactuted'; choose one of ...
+    """
+    if os.fspath(name) in names():
+        return ENTRIES / name
+    folder = Path(name).expanduser()
+    if not folder.is_dir():
+        try:
+            check_choice("zoo", os.fspath(name), names())
+        except ValueError as error:
+            _, _, choices = str(error).partition("; ")
+            raise ZooError(
+                f"The zoo has no {os.fspath(name)!r}; {choices.removesuffix('.')}, or pass the "
+                "folder of another entry."
+            ) from None
+    return folder
+
+
+def read_card(name: str | os.PathLike[str]) -> Card:
+    """What is known of an entry, see :class:`Card`.
+
+    Raises:
+        ZooError: if there is no such entry, or its card is damaged.
+    """
+    folder = find(name)
+    if not (folder / CARD).exists():
+        held = "synergies alone" if _holds_bundle(folder) else "no entry of the zoo"
+        raise ZooError(
+            f"{folder} holds {held}; pass an entry with a policy, of which {CARD} and {WEIGHTS} "
+            "are parts."
+        )
+    return Card.read(folder)
+
+
+def load(
+    name: str | os.PathLike[str],
+    *,
+    env: EnvBase | None = None,
+    device: torch.device | str | None = None,
+) -> tuple[TensorDictModuleBase, EnvBase]:
+    """A trained policy and the environment of its task.
+
+    The policy acts without noise unless a collector asks for it, and writes muscle actions: a
+    decoder, where it has one, is a part of it. Nothing in an entry is executed. The digest guards
+    against damage, not against forgery.
+
+    Args:
+        name (str or path-like): an entry, see :func:`find`.
+
+    Keyword Args:
+        env (EnvBase, optional): an environment to act in. Default: one of the entry's task.
+        device (torch.device, optional): of the policy and of that environment. Default: the CPU.
+
+    Returns:
+        policy and environment.
+
+    Raises:
+        ZooError: if there is no such entry, it is damaged, or its policy is not one of the
+            environment's sizes, bounds and muscles.
+
+    Examples:
+        >>> from torchrl_etl import zoo
+        >>> policy, env = zoo.load("overactuated")
+        >>> env.rollout(2, policy)["next", "reward"].shape
+        torch.Size([2, 1])
+    """
+    folder, card = find(name), read_card(name)
+    policy = _policy(folder, card).to(device or "cpu")
+    if env is None:
+        env = _make_env(folder, card, device)
+    _check_env(folder, card, EnvironmentSpec.of(env))
+    return policy, env
+
+
+def synergies(name: str | os.PathLike[str]) -> Path:
+    """The folder of an entry's synergy bundle, as ``synergies=zoo:NAME`` takes it.
+
+    Raises:
+        ZooError: if there is no such entry, or it has no bundle.
+    """
+    folder = find(name)
+    if not _holds_bundle(folder):
+        raise ZooError(f"{folder} has no synergies; its policy moves muscles one by one.")
+    return folder
+
+
+def save_entry(
+    folder: str | os.PathLike[str],
+    policy: TensorDictModuleBase,
+    card: Card,
+    *,
+    bundle: str | os.PathLike[str] | None = None,
+) -> Path:
+    """Write an entry, whole or not at all; one that is there is replaced.
+
+    Args:
+        folder (path-like): the entry's folder; parents are created.
+        policy (TensorDictModuleBase): one of :func:`~torchrl_etl.zoo.make_policy`, or the policy of
+            a learner that the card describes.
+        card (Card): the digest is filled in.
+
+    Keyword Args:
+        bundle (path-like, optional): a synergy bundle or a run folder that holds one.
+
+    Returns:
+        Path: the folder.
+
+    Raises:
+        ZooError: if the folder holds anything but an entry, or the card does not describe the
+            policy.
+    """
+    folder = Path(folder).expanduser().resolve()
+    own = {CARD, WEIGHTS, *BUNDLE_FILES}
+    if folder.exists():
+        others = [path.name for path in folder.iterdir() if path.name not in own]
+        if others:
+            raise ZooError(
+                f"{folder} holds {others[0]!r}, and an entry there would remove it; choose a "
+                "folder of its own."
+            )
+    state = {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}
+    weights = safetensors.torch.save(state)
+    files = {} if bundle is None else bundle_files(bundle)
+    card = replace(card, sha256=hashlib.sha256(weights).hexdigest())
+    _fill(folder, make_policy(**card.policy), state)
+    replace_folder(folder, {CARD: card.json.encode(), WEIGHTS: weights, **files})
+    return folder
+
+
+def _holds_bundle(folder: Path) -> bool:
+    return all((folder / name).exists() for name in BUNDLE_FILES)
+
+
+def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
+    path = folder / WEIGHTS
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ZooError(
+            f"{path} cannot be read ({error.strerror}); copy the entry again."
+        ) from error
+    if hashlib.sha256(content).hexdigest() != card.sha256:
+        raise ZooError(
+            f"{path} is damaged or belongs to another entry: its SHA-256 is not the one in {CARD}; "
+            "copy the entry again."
+        )
+    try:
+        return _fill(folder, make_policy(**card.policy), safetensors.torch.load(content))
+    except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+        if isinstance(error, ZooError):
+            raise
+        raise ZooError(
+            f"{CARD} in {folder} describes no policy ({error}); copy it again."
+        ) from error
+
+
+def _fill(
+    folder: Path, policy: TensorDictModuleBase, state: dict[str, torch.Tensor]
+) -> TensorDictModuleBase:
+    broken = next((key for key, value in state.items() if not value.isfinite().all()), None)
+    if broken is not None:
+        raise ZooError(
+            f"{broken} of the policy for {folder} is not finite: its training diverged, so use one "
+            "of a run that did not."
+        )
+    try:
+        policy.load_state_dict(state)
+    except RuntimeError as error:
+        raise ZooError(
+            f"The weights of {folder} are not those of the policy that its {CARD} describes "
+            f"({' '.join(str(error).split())[:200]}); both must be of one run and one release."
+        ) from error
+    return policy
+
+
+def _make_env(folder: Path, card: Card, device: torch.device | str | None) -> EnvBase:
+    name = str(card.task.get("name"))
+    module = name.rpartition(":")[0]
+    if module and module not in sys.modules:
+        raise ZooError(
+            f"The task of {folder} is {name!r}, and a file does not get to import {module!r}; "
+            "import it yourself first."
+        )
+    try:
+        return make_env(**card.task, device=device)
+    except (TypeError, ValueError) as error:
+        raise ZooError(f"{CARD} in {folder} names no task that can be built: {error}") from error
+
+
+def _check_env(folder: Path, card: Card, found: EnvironmentSpec) -> None:
+    made, has = card.policy, f"The policy of {folder}"
+    if found.observation_dim != made["observation_dim"]:
+        raise ZooError(
+            f"{has} reads {made['observation_dim']} observations and the environment gives "
+            f"{found.observation_dim}; use the release of its simulator that the card names."
+        )
+    if list(found.actuators) != card.actuators:
+        raise ZooError(
+            f"{has} moves {len(card.actuators)} actuators ({card.actuators[0]}, ...) that are not "
+            f"the environment's {found.action_dim} ({found.actuators[0]}, ...) by name and order; "
+            "use it on its own body."
+        )
+    for side in ("low", "high"):
+        theirs = getattr(found, side).cpu().numpy()
+        if not np.allclose(made[side], theirs):
+            raise ZooError(
+                f"{has} has other {side} action bounds than the environment; the action is scaled "
+                "otherwise, so use the release of its simulator that the card names."
+            )

@@ -1,0 +1,117 @@
+"""A trained learner's policy, built again from what its card says of the networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+)
+from torchrl.data import Bounded
+
+from torchrl_etl.baselines import SARDecoder, make_dynsyn_actor, make_lattice_actor
+from torchrl_etl.checks import check_choice
+from torchrl_etl.learners import NORMALIZED, from_observation
+from torchrl_etl.modules import RunningNorm, SynergyDecoder, SynergyMap, make_actor
+
+__all__ = ["ACTORS", "describe_decoder", "make_policy"]
+
+ACTORS: dict[str, Callable[..., ProbabilisticTensorDictSequential]] = {
+    "gaussian": make_actor,
+    "lattice": make_lattice_actor,
+    "dynsyn": make_dynsyn_actor,
+}
+"""What makes an actor, by its kind."""
+
+
+def make_policy(
+    *,
+    observation_dim: int,
+    low: list[float],
+    high: list[float],
+    actor: Mapping[str, Any],
+    decoder: Mapping[str, Any] | None = None,
+    normalize_observations: bool = False,
+) -> TensorDictModuleBase:
+    """The policy of a :class:`~torchrl_etl.learners.SACLearner`, with weights still to be loaded.
+
+    By default it acts without noise; a collector, which asks for it, gets noise.
+
+    Keyword Args:
+        observation_dim (int): size of an observation.
+        low, high (list of float): bounds of the action [n].
+        actor (mapping): its ``kind``, one of :data:`ACTORS`, and arguments of its function.
+        decoder (mapping, optional): what :func:`describe_decoder` says of it.
+        normalize_observations (bool): whether the actor reads them normalized.
+
+    Raises:
+        TypeError, ValueError: for arguments that make no policy.
+
+    Examples:
+        >>> policy = make_policy(
+        ...     observation_dim=3, low=[-1.0] * 2, high=[1.0] * 2, actor={"kind": "gaussian"}
+        ... )
+        >>> policy.in_keys, policy.out_keys
+        (['observation'], ['loc', 'scale', 'action'])
+    """
+    options = dict(actor)
+    check_choice("kind", kind := options.pop("kind", None), list(ACTORS))
+    # The weights drawn here are overwritten at once: do not let them advance the global seed.
+    with torch.random.fork_rng(devices=[]):
+        emitted, out_key, map_ = _spec(low, high), "action", None
+        if decoder is not None:
+            map_ = _make_decoder(decoder, low, high)
+            emitted, out_key = map_.synergy_spec, map_.in_keys[0]
+        norm = RunningNorm(observation_dim) if normalize_observations else None
+        inputs = {"observation" if norm is None else NORMALIZED: observation_dim}
+        policy = from_observation(
+            ACTORS[kind](inputs, emitted, out_key=out_key, **options), norm, map_
+        )
+    for module in policy.modules():
+        if isinstance(module, ProbabilisticTensorDictModule):
+            module.default_interaction_type = InteractionType.DETERMINISTIC
+    return policy.requires_grad_(False).eval()
+
+
+def describe_decoder(decoder: SynergyMap | None) -> dict[str, Any] | None:
+    """What :func:`make_policy` builds a decoder from.
+
+    Raises:
+        ValueError: for a decoder that is neither ETL's nor SAR's.
+
+    Examples:
+        >>> describe_decoder(SynergyDecoder(2, 3, hidden=[8]))
+        {'kind': 'synergies', 'num_synergies': 2, 'hidden': [8], 'residual': 0.0}
+    """
+    if decoder is None:
+        return None
+    if type(decoder) is SynergyDecoder:
+        config = decoder.config
+        kept = {key: config[key] for key in ("num_synergies", "hidden", "residual")}
+        return {"kind": "synergies", **kept}
+    if type(decoder) is SARDecoder:
+        return {"kind": "sar", "num_synergies": decoder.num_synergies, "blend": decoder.blend}
+    raise ValueError(
+        f"The policy decodes with a {type(decoder).__name__}, which an entry of the zoo does not "
+        "hold; export runs that use SynergyDecoder or SARDecoder."
+    )
+
+
+def _spec(low: list[float], high: list[float]) -> Bounded:
+    low, high = torch.tensor(low), torch.tensor(high)
+    return Bounded(low, high, shape=low.shape, dtype=torch.float32)
+
+
+def _make_decoder(described: Mapping[str, Any], low: list[float], high: list[float]) -> SynergyMap:
+    options = dict(described)
+    check_choice("kind", kind := options.pop("kind", None), ("synergies", "sar"))
+    number = options.pop("num_synergies")
+    if kind == "synergies":
+        return SynergyDecoder(number, len(low), low=low, high=high, **options)
+    blank = torch.zeros(1 + number, len(low))
+    return SARDecoder(blank[0], blank[1:], low=low, high=high, **options)
