@@ -111,6 +111,16 @@ def test_the_policy_s_coefficients_stand_on_the_sliders():
     assert session.coefficients.tolist() == [0.25, 0.25]
 
 
+def test_a_policy_without_synergies_needs_no_decoder():
+    policy = TensorDictModule(lambda x: x.new_full((16,), 0.5), ["observation"], ["action"])
+    session = open_session(policy=policy)
+    assert session.subject.drivers == ["policy"] and not session.has_residual
+    session.step()
+    assert session.action.tolist() == [0.5] * 16
+    with pytest.raises(ValueError, match="driver is 'sliders'; choose one of policy"):
+        session.drive("sliders")
+
+
 def test_without_its_residual_a_policy_moves_muscles_through_synergies_alone():
     decoder = make_decoder(residual=0.5)
     session = open_session(decoder=decoder, policy=acting(0.25, decoder))
@@ -158,6 +168,25 @@ def test_what_nothing_can_move_is_refused():
 def test_a_coefficient_out_of_its_box_is_refused():
     with pytest.raises(ValueError, match=re.escape("in [-1, 1]")):
         open_session().move(0, 1.5)
+
+
+def test_sliders_move_a_body_that_is_held_where_it_stands():
+    names = actuator_names("humanoid-stand")
+    directions = torch.zeros(1, len(names))
+    directions[0, names.index("right_elbow")] = 0.9
+    decoder = SynergyDecoder.from_directions(torch.zeros(len(names)), directions)
+    make = lambda goal: make_env("humanoid-stand")  # noqa: E731
+    with Session(Subject("", resolve_task("humanoid-stand"), make, names, decoder)) as session:
+        place, elbow = session.data.qpos[:7].copy(), session.data.joint("right_elbow")
+        before = elbow.qpos.item()
+        session.move(0, 1.0)
+        for _ in range(5):
+            session.step()
+        np.testing.assert_array_equal(session.data.qpos[:7], place)
+        assert elbow.qpos.item() > before + 0.1
+        session.hold = False
+        session.step()
+        assert session.data.qpos[2] != place[2]
 
 
 # A body of its own: a motor on a hinge, and a muscle whose tendon runs straight up.
