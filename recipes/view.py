@@ -9,6 +9,7 @@ These are all settings, with their defaults:
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 
@@ -33,6 +34,8 @@ def main(config: DictConfig) -> None:
         session = Session(open_subject(config))
         page = Page(session, host=config.host, port=config.port, say=print)
     print(f"{session.subject.name} is shown at {page.address} (Ctrl-C ends it)", flush=True)
+    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell's & has it ignored
+        signal.signal(number, signal.default_int_handler)
     try:
         page.run()
     except KeyboardInterrupt:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
+from urllib.request import urlopen
 
 import pytest
 from omegaconf import OmegaConf
@@ -13,9 +17,11 @@ from omegaconf import OmegaConf
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.analysis.viewer.page import Page, check_port
+from torchrl_etl.envs import actuator_names
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.opened import open_bundle, open_run
-from torchrl_etl.synergies import BundleError
+from torchrl_etl.synergies import BundleError, save_bundle
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +122,22 @@ def test_view_says_in_a_sentence_what_to_name(recipe, settings, message):
     defaults = OmegaConf.load(ROOT / "recipes" / "conf" / "view.yaml")
     with pytest.raises(ValueError, match=re.escape(message)):
         recipe.open_subject(OmegaConf.merge(defaults, settings))
+
+
+@pytest.mark.slow
+def test_view_prints_an_address_that_answers_and_ctrl_c_ends_it(tmp_path):
+    names = actuator_names("cartpole-balance")
+    bundle = save_bundle(
+        SynergyDecoder(1, 1), tmp_path / "a bundle", task="cartpole-balance", actuators=names
+    )
+    command = [sys.executable, str(ROOT / "recipes" / "view.py"), f"bundle={bundle}", "port=0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    try:
+        line = process.stdout.readline()
+        assert str(bundle) in line and "http://127.0.0.1:" in line
+        with urlopen(re.search(r"http://[\d.:]+", line)[0]) as page:
+            assert b"<html" in page.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0 and "has ended" in process.stdout.read()
+    finally:
+        process.kill()
