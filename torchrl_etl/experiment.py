@@ -13,6 +13,7 @@ import torch
 from torchrl.checkpoint import Checkpoint
 
 from torchrl_etl.checks import check_choice
+from torchrl_etl.collectors import start_resource_tracker
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.methods import METHODS
@@ -56,6 +57,7 @@ class Experiment:
         unique: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
+        start_resource_tracker()
         validate(config)
         check_choice("method.learner", config.method.learner, list(METHODS))
         self.config = config.copy()

@@ -4,7 +4,7 @@ from torchrl_etl.collectors.batches import Batches, CollectionError
 from torchrl_etl.collectors.factory import COLLECTORS, make_batches
 from torchrl_etl.collectors.process import AsyncProcessWorkers, ProcessWorkers
 from torchrl_etl.collectors.vector import VectorCollector
-from torchrl_etl.collectors.worker_process import STOP_SIGNALS
+from torchrl_etl.collectors.worker_process import STOP_SIGNALS, start_resource_tracker
 
 __all__ = [
     "COLLECTORS",
@@ -15,4 +15,5 @@ __all__ = [
     "ProcessWorkers",
     "VectorCollector",
     "make_batches",
+    "start_resource_tracker",
 ]

@@ -8,9 +8,15 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 
-__all__ = ["STOP_SIGNALS", "live_as_long_as_the_learner", "stop_signals_blocked"]
+__all__ = [
+    "STOP_SIGNALS",
+    "live_as_long_as_the_learner",
+    "start_resource_tracker",
+    "stop_signals_blocked",
+]
 
 # What asks a run to save and leave: Ctrl-C, kill and Slurm, Slurm's --signal, a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
@@ -42,6 +48,16 @@ def stop_signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def start_resource_tracker() -> None:
+    """Start Python's resource tracker, which the first lock would start, deaf to stop signals.
+
+    By itself it is deaf to Ctrl-C and SIGTERM alone; another signal to all processes of a run would
+    end it, and each lock that it knew of is then a traceback when the run ends.
+    """
+    with stop_signals_blocked():
+        resource_tracker.ensure_running()
 
 
 def _end_with(sentinel: int) -> None:
