@@ -1,6 +1,7 @@
 """Look at a body in the browser: its synergies under sliders, its policies at work.
 
     python recipes/view.py run=runs/NAME
+    python recipes/view.py zoo=NAME
     python recipes/view.py bundle=runs/NAME/synergies env=myoHandPenTwirl
     ssh -L 8080:localhost:8080 MACHINE     # for a run on another machine
 
@@ -18,10 +19,10 @@ from omegaconf import DictConfig
 
 from torchrl_etl.analysis.viewer import Session, Subject
 from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
-from torchrl_etl.opened import open_bundle, open_run
+from torchrl_etl.opened import open_bundle, open_run, open_zoo
 
 CONF = Path(__file__).parent / "conf"
-SOURCES = ("run", "bundle")
+SOURCES = ("run", "zoo", "bundle")
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="view")
@@ -48,11 +49,13 @@ def open_subject(config: DictConfig) -> Subject:
     if len(named) != 1:
         raise ValueError(
             f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
-            "pass run=PATH, the folder that etl_sac.py printed, or bundle=PATH env=TASK."
+            "pass run=PATH, the folder that etl_sac.py printed, zoo=NAME, or bundle=PATH env=TASK."
         )
+    if named != ["bundle"] and (config.env is not None or config.goal is not None):
+        raise ValueError(f"{named[0]} has a task of its own; leave env and goal out.")
+    if named == ["zoo"]:
+        return open_zoo(config.zoo)
     if named == ["run"]:
-        if config.env is not None or config.goal is not None:
-            raise ValueError("A run has a task of its own; leave env and goal out.")
         return open_run(Path(config.run), defaults=hydra.compose("config"))
     return open_bundle(Path(config.bundle), config.env, goal=config.goal)
 

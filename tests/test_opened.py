@@ -20,8 +20,9 @@ from torchrl_etl.analysis.viewer.page import Page, check_port
 from torchrl_etl.envs import actuator_names
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.opened import open_bundle, open_run
+from torchrl_etl.opened import open_bundle, open_run, open_zoo
 from torchrl_etl.synergies import BundleError, save_bundle
+from torchrl_etl.zoo import read_card
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,15 @@ def test_a_bundle_is_shown_on_the_task_that_it_was_explored_on(finished):
     assert subject.decoder.residual == 0.0
 
 
+def test_an_entry_of_the_zoo_has_the_returns_of_its_card():
+    subject = open_zoo("overactuated")
+    with Session(subject) as session:
+        while not session.over:
+            session.step()
+    card = read_card("overactuated").evaluation
+    assert session.total_reward == pytest.approx(card["episodes"]["returns"][0], rel=1e-4)
+
+
 def test_a_bundle_of_another_body_is_refused(finished):
     with pytest.raises(BundleError, match="it is for another body"):
         open_bundle(finished, "humanoid-stand")
@@ -115,6 +125,7 @@ def recipe():
         ({}, "nothing to look at was named; pass run=PATH"),
         ({"run": "a", "bundle": "b"}, "run and bundle were named"),
         ({"run": "a", "env": "dog-run"}, "leave env and goal out"),
+        ({"zoo": "a", "goal": "random"}, "leave env and goal out"),
         ({"bundle": "nowhere"}, "no synergy bundle at 'nowhere'"),
     ],
 )

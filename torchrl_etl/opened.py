@@ -1,4 +1,4 @@
-"""Runs and bundles opened to be looked at: what in them can move a body."""
+"""Runs, bundles and entries of the zoo opened to be looked at: what in them can move a body."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from pathlib import Path
 from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint
 
+from torchrl_etl import zoo
 from torchrl_etl.analysis.viewer import Subject
 from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.methods.etl import ETL
 from torchrl_etl.methods.explorer import Explorer
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import EVALUATION_SEED
 from torchrl_etl.training.resumed import resumed_config
 
-__all__ = ["open_bundle", "open_run"]
+__all__ = ["open_bundle", "open_run", "open_zoo"]
 
 
 def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
@@ -83,6 +85,39 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
         spec.actuators,
         decoder=decoder,
         episode_steps=task.episode_steps,
+        first_seed=EVALUATION_SEED,
+    )
+
+
+def open_zoo(name: str) -> Subject:
+    """The policy of an entry of the zoo, and its synergies where it acts through some.
+
+    Args:
+        name (str): an entry, see :func:`torchrl_etl.zoo.find`.
+
+    Raises:
+        ZooError: if there is no such entry, or it is damaged.
+
+    Examples:
+        >>> from torchrl_etl.opened import open_zoo
+        >>> open_zoo("overactuated").drivers[0]
+        'policy'
+    """
+    card = zoo.read_card(name)
+    policy, env = zoo.load(name)
+    env.close()
+    of_task = dict(card.task)
+    built, goal = of_task.pop("name"), of_task.pop("goal", None)
+    limit = (of_task.get("env_kwargs") or {}).get("max_episode_steps")
+    limit = limit or episode_length(built, goal) or 1000
+    return Subject(
+        f"zoo={name}",
+        resolve_task(built, goal),
+        lambda goal: make_env(built, goal=goal, **of_task),
+        card.actuators,
+        decoder=next((part for part in policy.modules() if isinstance(part, SynergyMap)), None),
+        policy=policy,
+        episode_steps=math.ceil(limit / of_task.get("action_repeat", 1)),
         first_seed=EVALUATION_SEED,
     )
 
