@@ -1,5 +1,6 @@
 # make demo: both stages of ETL on a MyoSuite hand, in a few minutes.
 # make test: the whole test suite, in the same environment.
+# make docs: the documentation site, into site/; opens with any static server.
 # make bench: speed and memory beside their peers, into docs/performance.md; under 20 minutes.
 # make smoke: both stages on each of the paper's 13 tasks, for as long as it takes to see them run.
 
@@ -11,12 +12,12 @@ BIN := $(VENV)/bin
 export MPLBACKEND := Agg
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test bench smoke lint lock clean
+.PHONY: demo test docs bench smoke lint lock clean
 
 demo: $(VENV)/.complete
 	$(BIN)/python recipes/etl_sac.py env=myoHandPenTwirl experiment=demo
 
-test: $(VENV)/.complete lint
+test: $(VENV)/.complete .venv-docs/.complete lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 smoke: $(VENV)/.complete
@@ -31,6 +32,15 @@ bench: $(VENV)/.complete .venv-peers/.complete
 .venv-peers/.complete: benchmarks/peers.lock
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --no-deps -r benchmarks/peers.lock
+	touch $@
+
+docs: .venv-docs/.complete
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/python -m mkdocs build --strict
+
+# The site's tools live apart: they read the source and import none of it.
+.venv-docs/.complete: website/requirements.lock
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m pip install --quiet --no-deps -r website/requirements.lock
 	touch $@
 
 lint: $(VENV)/.complete
@@ -51,4 +61,4 @@ lock:
 	$(BIN)/python -m pip freeze --exclude-editable --all | grep -v '^pip==' | sed 's/+cpu//' > requirements.lock
 
 clean:
-	rm -rf $(VENV) .venv-peers
+	rm -rf $(VENV) .venv-peers .venv-docs site

@@ -1,0 +1,139 @@
+"""The documentation site: its navigation, a strict build, and its pages on a phone.
+
+The build needs ``make docs``' environment, the browser test Chromium and Playwright as well.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+GENERATED = {"index.md", "changelog.md", "api/"}  # by website/pages.py
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+PHONE = {"width": 390, "height": 844}
+PAGES = (
+    "",
+    "tutorials/explore/",
+    "architecture/",
+    "faithfulness/",
+    "results/",
+    "api/",
+    "api/functional/",
+    "api/objectives/",
+)
+# Stands in for the script that draws diagrams, which the page fetches from elsewhere.
+MERMAID = """window.mermaid = {
+    initialize() {},
+    render: async (id, text) => ({svg: `<svg data-lines="${text.split("\\n").length}"/>`}),
+}"""
+
+
+class Settings(yaml.SafeLoader):
+    """mkdocs.yml without what its tags would import."""
+
+
+Settings.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
+
+
+def navigation() -> list[str]:
+    def files(entry):
+        if isinstance(entry, str):
+            return [entry]
+        children = entry.values() if isinstance(entry, dict) else entry
+        return [file for child in children for file in files(child)]
+
+    settings = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Settings)
+    return files(settings["nav"])
+
+
+def test_the_navigation_has_every_page_once_and_no_other():
+    written = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
+    assert sorted(navigation()) == sorted(written | GENERATED)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    python = ROOT / ".venv-docs" / "bin" / "python"
+    if not python.exists():
+        if not (importlib.util.find_spec("mkdocs") and importlib.util.find_spec("mkdocstrings")):
+            pytest.skip("the site needs MkDocs in its own environment: make docs")
+        python = Path(sys.executable)
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [python, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly_and_shows_every_public_name(site):
+    overview = (site / "api" / "index.html").read_text(encoding="utf-8")
+    transforms = (site / "api" / "transforms" / "index.html").read_text(encoding="utf-8")
+    assert "transforms/#torchrl_etl.transforms.SynergyAction" in overview
+    assert 'id="torchrl_etl.transforms.SynergyAction"' in transforms
+    assert 'class="admonition deviates"' in transforms
+    shown = re.sub(r"<(pre|code|details)\b.*?</\1>", "", transforms, flags=re.DOTALL)
+    assert not re.search(r":(class|func|meth|math):|\.\. math::", shown)
+
+
+@pytest.fixture(scope="module")
+def address(site) -> Iterator[str]:
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=site))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    thread.join()
+
+
+@pytest.mark.slow
+def test_pages_fit_a_phone_without_an_error_and_draw_their_diagrams(request):
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="the browser test needs Playwright: pip install playwright"
+    )
+    if CHROMIUM is None:
+        pytest.skip("the browser test needs Chromium: apt-get install chromium")
+    address = request.getfixturevalue("address")
+    faults, wide = [], []
+    with playwright.sync_playwright() as engines:
+        chromium = engines.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        tab = chromium.new_page(viewport=PHONE)
+        tab.route(
+            lambda url: not url.startswith(address),
+            lambda route: route.fulfill(body=MERMAID, content_type="text/javascript"),
+        )
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.on("console", lambda said: faults.append(said.text) if said.type == "error" else None)
+        for page in PAGES:
+            tab.goto(address + page)
+            width = tab.evaluate("document.documentElement.scrollWidth")
+            if width > PHONE["width"]:
+                wide.append((page, width))
+        tab.goto(address + "architecture/")
+        # Material hides the drawing in a closed shadow root in the fence's place.
+        tab.locator("div.mermaid").first.wait_for(state="attached")
+        assert tab.locator("pre.mermaid").count() == 0
+        chromium.close()
+    assert (faults, wide) == ([], [])
