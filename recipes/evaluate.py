@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,10 +22,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.gl_backend import draw_without_display
 
-if "video=true" in sys.argv[1:]:
+if "video=true" in map(str.lower, sys.argv[1:]):
     draw_without_display()
 from torchrl_etl import zoo
-from torchrl_etl.checks import check_integer
+from torchrl_etl.analysis.moving_pictures import write_moving_pictures
+from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.command_line import (
     check_overrides,
     one_sentence,
@@ -34,10 +37,10 @@ from torchrl_etl.envs import resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.io import as_json, write_atomically
 from torchrl_etl.training import (
+    EpisodeRecorder,
     Evaluation,
     check_video_size,
     evaluate_task,
-    record_episodes,
     resumed_config,
 )
 
@@ -48,14 +51,19 @@ CONF = Path(__file__).parent / "conf"
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with one_sentence(ValueError, OSError, ImportError):
-        size = check_video_size(config.video_size)
         check_integer(1, episodes=config.episodes)
+        check_flag(video=config.video, video_before=config.video_before)
+        check_real("(0, inf)", video_seconds=config.video_seconds)
+        size = check_video_size(
+            config.video_size, episodes=config.video_episodes, sides=1 + config.video_before
+        )
         if (config.run is None) == (config.zoo is None):
             named = "no run is named" if config.run is None else "a run and an entry are named"
             raise ValueError(
                 f"{named}; pass run=PATH, the folder that etl_sac.py printed, or zoo=NAME."
             )
         trained = of_a_run(config) if config.zoo is None else of_the_zoo(config)
+        recorder = open_recorder(config, trained.env, size) if config.video else None
         task = resolve_task(trained.task["name"], trained.task["goal"])
         evaluation = evaluate_task(
             trained.policy, trained.env, trained.task, episodes=config.episodes
@@ -75,23 +83,20 @@ def main(config: DictConfig) -> None:
     if trained.card is not None:
         print(f"  {beside(trained.card, evaluation)}")
     print(f"  written to {path}")
-    if config.video:
-        with one_sentence(RuntimeError, ValueError):
-            videos = record_episodes(
-                trained.env,
-                trained.policy,
-                trained.folder / "videos",
-                episodes=config.video_episodes,
-                size=size,
-                camera=config.video_camera,
-            )
+    if recorder is not None:
+        with one_sentence(OSError), recorder:
+            videos = draw_episodes(config, trained, recorder)
         print("  videos  " + ", ".join(str(video) for video in videos))
 
 
 class Trained(NamedTuple):
-    """A policy, where it acts, and where results go; of an entry of the zoo also its card."""
+    """A policy, what it was before training, where it acts, and where results go.
+
+    An entry of the zoo also has a card.
+    """
 
     policy: TensorDictModuleBase
+    untrained: Callable[[], TensorDictModuleBase]
     env: EnvBase
     task: dict[str, Any]
     folder: Path
@@ -105,13 +110,35 @@ def of_a_run(config: DictConfig) -> Trained:
         resumed_config(run, device, defaults=hydra.compose("config")), resume=run
     )
     policy, context = experiment.learned().learner.policy, experiment.context
-    return Trained(policy, context.make_env(), context.task, experiment.folder.path)
+    return Trained(
+        policy, experiment.untrained, context.make_env(), context.task, experiment.folder.path
+    )
 
 
 def of_the_zoo(config: DictConfig) -> Trained:
     card = zoo.read_card(config.zoo)
     policy, env = zoo.load(config.zoo, device=config.device)
-    return Trained(policy, env, card.task, Path(f"runs/zoo-{Path(config.zoo).name}"), card)
+    before = partial(zoo.untrained, config.zoo, device=config.device)
+    return Trained(policy, before, env, card.task, Path(f"runs/zoo-{Path(config.zoo).name}"), card)
+
+
+def open_recorder(config: DictConfig, env: EnvBase, size: tuple[int, int]) -> EpisodeRecorder:
+    """Before the evaluation, so that what is missing for it is missed at once."""
+    with one_sentence(RuntimeError):
+        return EpisodeRecorder(
+            env, size=size, camera=config.video_camera, seconds=config.video_seconds
+        )
+
+
+def draw_episodes(config: DictConfig, trained: Trained, recorder: EpisodeRecorder) -> list[Path]:
+    policies = {"after training": trained.policy}
+    if config.video_before:
+        policies = {"before training": trained.untrained(), **policies}
+    sides = {
+        caption: recorder.record(policy, config.video_episodes)
+        for caption, policy in policies.items()
+    }
+    return write_moving_pictures(trained.folder / "videos", sides)
 
 
 def beside(card: zoo.Card, evaluation: Evaluation) -> str:

@@ -12,6 +12,7 @@ import sys
 from urllib.request import urlopen
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from tests.configs import ROOT, tiny
@@ -47,6 +48,22 @@ def test_a_run_of_both_stages_can_be_moved_by_its_policy_by_sliders_and_along_di
         for driver in opened.drivers:
             session.drive(driver)
             session.step()
+
+
+def test_an_untrained_policy_is_the_run_s_own_before_its_first_frame(finished):
+    def weights(policy):
+        return torch.cat([value.flatten().float() for value in policy.state_dict().values()])
+
+    experiment = Experiment(OmegaConf.load(finished / "config.yaml"), resume=finished)
+    learned = weights(experiment.learned().learner.policy)
+    torch.rand(7)  # whatever was drawn meanwhile
+    before = weights(experiment.untrained())
+    assert torch.equal(before, weights(experiment.method.stage().learner.policy))
+    assert not torch.equal(before, learned)
+    decoder = open_bundle(finished).decoder.state_dict()
+    found = [part for part in experiment.untrained().modules() if isinstance(part, SynergyDecoder)]
+    for key, value in found[0].state_dict().items():
+        assert torch.equal(value, decoder[key]), "the synergies that learning began with"
 
 
 def test_episode_0_of_a_run_is_the_first_that_it_is_evaluated_on(opened, finished):

@@ -95,12 +95,15 @@ def test_evaluate_draws_a_video_or_says_what_to_install(hand):
         "episodes=1",
         "video=true",
         "video_episodes=1",
+        "video_seconds=0.2",
+        "video_size=[64,80]",
         cwd=hand.parent,
     )
     if done.returncode:
         assert "install a GL back end" in done.stderr and "Traceback" not in done.stderr
     else:
-        assert (hand / "videos" / "episode0.mp4").stat().st_size > 10_000
+        for name in ("episodes.mp4", "episodes.webp"):
+            assert (hand / "videos" / name).stat().st_size > 1_000
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint
 
 from torchrl_etl.checks import check_choice
@@ -116,6 +117,11 @@ class Experiment:
             )
         Checkpoint(policy=stage.learner.policy, progress=stage.progress).load(folder)
         return stage
+
+    def untrained(self) -> TensorDictModuleBase:
+        """The policy as it was before its first frame: weights that the run's seed draws, acting
+        through the synergies that learning began with, if any."""
+        return self.method.stage().learner.policy
 
     def charged(self) -> int:
         """Frames that went before learning: those that the run's own bundle tells of, if any."""

@@ -9,7 +9,7 @@ from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.sweep import Run, Sweep
 from torchrl_etl.training.together import together
-from torchrl_etl.training.video import check_video_size, record_episodes
+from torchrl_etl.training.video import EpisodeRecorder, check_video_size
 from torchrl_etl.training.work import alone
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Context",
+    "EpisodeRecorder",
     "Evaluation",
     "Interrupted",
     "Run",
@@ -26,7 +27,6 @@ __all__ = [
     "check_video_size",
     "evaluate",
     "evaluate_task",
-    "record_episodes",
     "resumed_config",
     "together",
     "validate",

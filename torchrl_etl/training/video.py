@@ -1,28 +1,41 @@
-"""Episodes as MP4, drawn by MuJoCo's own renderer."""
+"""Episodes of a policy as pictures, muscles in the colour of their activation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_etl.envs import mujoco_state
+from torchrl_etl.analysis.moving_pictures import CAPTION_HEIGHT, FPS, grid_shape
+from torchrl_etl.analysis.viewer.framing import middle_and_size, planes, scenery
+from torchrl_etl.checks import check_integer
+from torchrl_etl.envs import has_free_root, mujoco_state
 from torchrl_etl.extras import extra
 from torchrl_etl.training.evaluation import EVALUATION_SEED
 
-__all__ = ["check_video_size", "record_episodes"]
+__all__ = ["EpisodeRecorder", "check_video_size"]
+
+_HIDDEN_GROUP = 5  # MuJoCo draws groups 0 to 2 unless it is told otherwise
+_MOST_PIXELS = 4096  # in either direction: what decoders of MP4 can be relied on to show
 
 
-def check_video_size(size: Sequence[int]) -> tuple[int, int]:
-    """Height and width, if a video can have them.
+def check_video_size(size: Sequence[int], *, episodes: int = 1, sides: int = 1) -> tuple[int, int]:
+    """Height and width of an episode's picture, if a video can have them.
+
+    Args:
+        size (sequence of int): height and width.
+
+    Keyword Args:
+        episodes (int): how many are in the grid. Default: 1.
+        sides (int): how many grids are side by side. Default: 1.
 
     Raises:
-        ValueError: if they are not two even numbers from 16 to 4096: the usual coding of colours
-            in MP4 takes two by two pixels together.
+        ValueError: if they are not two even numbers from 16 to 4096 (the usual coding of colours
+            in MP4 takes two by two pixels together), or all episodes together are larger.
 
     Examples:
         >>> check_video_size([480, 640])
@@ -32,84 +45,156 @@ def check_video_size(size: Sequence[int]) -> tuple[int, int]:
         ...
         ValueError: video_size is [480, 641]; it must be ...
     """
+    check_integer(1, video_episodes=episodes)
     listed = isinstance(size, Sequence) and not isinstance(size, str)
     numbers = list(size) if listed else size
     if not (
         listed
         and len(numbers) == 2
         and all(isinstance(number, int) and number % 2 == 0 for number in numbers)
-        and all(16 <= number <= 4096 for number in numbers)
+        and all(16 <= number <= _MOST_PIXELS for number in numbers)
     ):
         raise ValueError(
-            f"video_size is {numbers!r}; it must be height and width, two even whole numbers from "
-            "16 to 4096, such as [480,640]."
+            f"video_size is {numbers!r}; it must be height and width of an episode, two even whole "
+            f"numbers from 16 to {_MOST_PIXELS}, such as [240,320]."
+        )
+    rows, columns = grid_shape(episodes)
+    height, width = CAPTION_HEIGHT + rows * numbers[0], sides * columns * numbers[1]
+    if max(height, width) > _MOST_PIXELS:
+        raise ValueError(
+            f"video_size={numbers!r} and video_episodes={episodes} make a picture of {height} by "
+            f"{width} pixels, which is more than {_MOST_PIXELS}; choose fewer or smaller ones."
         )
     return numbers[0], numbers[1]
 
 
-def record_episodes(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    folder: Path,
-    *,
-    episodes: int,
-    size: tuple[int, int] = (480, 640),
-    camera: str | None = None,
-    max_steps: int = 1000,
-) -> list[Path]:
-    """Render the deterministic policy on the first evaluation seeds.
+class EpisodeRecorder:
+    """Draws a MuJoCo environment while a policy acts in it, headless too.
+
+    Tendons have the colours of :func:`~torchrl_etl.analysis.viewer.muscles.colors`: slate at rest,
+    red when active. Time in the frames is that of the simulation, 25 to a second.
 
     Args:
         env (EnvBase): a single environment on MuJoCo, transforms included.
-        policy (TensorDictModuleBase): the policy.
-        folder (path): where ``episode0.mp4`` and so on go.
 
     Keyword Args:
-        episodes (int): number of episodes.
         size (tuple of int): height and width in pixels.
-        camera (str, optional): a camera of the model; by default its first, or else one that sees
-            the whole scene.
-        max_steps (int): where to cut an episode that does not end.
+        camera (str, optional): a camera of the model, which sees the whole scene. Default: one that
+            keeps the body in the middle and leaves out what stands around it for show.
+        seconds (float): simulated seconds after which an episode is cut. Default: 10.
 
     Raises:
         RuntimeError: if the machine has no way to draw, naming what to install.
         ValueError: if the environment does not run on MuJoCo or has no such camera.
     """
-    model, data = mujoco_state(env)
-    with extra("video"):
-        import imageio.v2 as imageio
-        import mujoco
-    cameras = [model.camera(i).name for i in range(model.ncam)]
-    if camera is not None and camera not in cameras:
-        raise ValueError(f"There is no camera {camera!r}; the model has {', '.join(cameras)}.")
-    view = camera or (0 if cameras else -1)
-    # The default frame buffer of most models is smaller than a readable picture.
-    model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
-    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
-    try:
-        renderer = mujoco.Renderer(model, *size)
-    except Exception as error:  # the GL back ends share no base class
-        raise RuntimeError(
-            f"MuJoCo cannot draw here ({type(error).__name__}: {error}); install a GL back end "
-            "(Debian: apt-get install libegl1, or libosmesa6 for software rendering) and set "
-            "MUJOCO_GL=egl or MUJOCO_GL=osmesa."
-        ) from error
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with (
-        renderer,
-        torch.no_grad(),
-        set_exploration_type(ExplorationType.DETERMINISTIC),
-    ):
-        for episode in range(episodes):
-            frames: list[np.ndarray] = []
 
-            def draw(*_: object, frames: list[np.ndarray] = frames) -> None:
-                renderer.update_scene(data, view)
-                frames.append(renderer.render())
+    def __init__(
+        self,
+        env: EnvBase,
+        *,
+        size: tuple[int, int] = (240, 320),
+        camera: str | None = None,
+        seconds: float = 10.0,
+    ) -> None:
+        self._env, self._seconds = env, seconds
+        self._model, self._data = mujoco_state(env)
+        model = self._model
+        with extra("video"):
+            import imageio.v2  # noqa: F401  (what will write the frames: missed now, not later)
+            import mujoco
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        if camera is not None and camera not in cameras:
+            named = ", ".join(cameras) or "none"
+            raise ValueError(f"There is no camera {camera!r}; the model has {named}.")
+        self._camera = camera
+        # The default frame buffer of most models is smaller than a readable picture.
+        model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
+        try:
+            self._renderer = mujoco.Renderer(model, *size)
+        except Exception as error:  # the GL back ends share no base class
+            raise RuntimeError(
+                f"MuJoCo cannot draw here ({type(error).__name__}: {error}); install a GL back end "
+                "(Debian: apt-get install libegl1, or libosmesa6 for software rendering) and set "
+                "MUJOCO_GL=egl or MUJOCO_GL=osmesa."
+            ) from error
+        self._follows, self._framed = has_free_root(env), None
+        for costly in ("SHADOW", "REFLECTION"):  # seconds a picture without a GPU
+            self._renderer.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{costly}")] = 0
+        if camera is None:
+            around = scenery(model) | (planes(model) & (not self._follows))
+            model.geom_group[around] = _HIDDEN_GROUP
 
-            env.set_seed(EVALUATION_SEED + episode)
-            env.rollout(max_steps, policy, callback=draw)
-            paths.append(folder / f"episode{episode}.mp4")
-            imageio.mimwrite(paths[-1], frames, fps=25, macro_block_size=1)
-    return paths
+    def record(
+        self, policy: TensorDictModuleBase, episodes: int, *, seed: int = EVALUATION_SEED
+    ) -> list[np.ndarray]:
+        """Frames [T, H, W, 3] of each of the first evaluation episodes, without noise.
+
+        Args:
+            policy (TensorDictModuleBase): the policy.
+            episodes (int): number of episodes.
+
+        Keyword Args:
+            seed (int): of the first; see :func:`~torchrl_etl.training.evaluate`.
+        """
+        device = self._env.device
+        devices = [device] if device is not None and device.type == "cuda" else []
+        with (
+            torch.random.fork_rng(devices),
+            torch.no_grad(),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
+            return [self._episode(policy, seed + number) for number in range(episodes)]
+
+    def _episode(self, policy: TensorDictModuleBase, seed: int) -> np.ndarray:
+        torch.manual_seed(seed)
+        self._env.set_seed(seed)
+        state, over = self._env.reset(), False
+        start, frames = self._data.time, [self.draw()]
+        while not over and (passed := self._data.time - start) < self._seconds:
+            if passed + 1e-9 >= len(frames) / FPS:
+                frames.append(self.draw())
+            after = self._env.step(policy(state))
+            over = bool(after["next", "done"].any())
+            state = self._env.step_mdp(after)
+        return np.stack([*frames, self.draw()])
+
+    def draw(self) -> np.ndarray:
+        """The present state [H, W, 3]."""
+        from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
+
+        self._renderer.update_scene(self._data, self._camera or self._view())
+        shades = colors(activations(self._model, self._data)) / 255
+        pulled = pulled_tendons(self._model)
+        for geom in self._tendons():
+            if geom.objid in pulled:
+                geom.matid, geom.rgba[:3] = -1, shades[pulled[geom.objid]]
+        return self._renderer.render()
+
+    def _view(self) -> Any:
+        """From the side, as the viewer begins; it goes with a body that walks away."""
+        import mujoco  # there, since its model is
+
+        if not self._follows and self._framed is not None:
+            return self._framed
+        middle, size = middle_and_size(self._model, self._data)
+        view = self._framed = mujoco.MjvCamera()
+        view.lookat, view.distance, view.azimuth, view.elevation = middle, 1.2 * size, 132.0, -24.0
+        return view
+
+    def _tendons(self) -> list[Any]:
+        import mujoco  # there, since its model is
+
+        scene = self._renderer.scene
+        tendon = int(mujoco.mjtObj.mjOBJ_TENDON)
+        return [geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == tendon]
+
+    def close(self) -> None:
+        """Give back what the drawing took; the environment stays open."""
+        self._renderer.close()
+
+    def __enter__(self) -> EpisodeRecorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -7,7 +7,16 @@ torch.Size([3, 16])
 """
 
 from torchrl_etl.zoo.card import Card, ZooError
-from torchrl_etl.zoo.entry import ENTRIES, find, load, names, read_card, save_entry, synergies
+from torchrl_etl.zoo.entry import (
+    ENTRIES,
+    find,
+    load,
+    names,
+    read_card,
+    save_entry,
+    synergies,
+    untrained,
+)
 from torchrl_etl.zoo.policy import describe_decoder, make_policy
 
 __all__ = [
@@ -22,4 +31,5 @@ __all__ = [
     "read_card",
     "save_entry",
     "synergies",
+    "untrained",
 ]

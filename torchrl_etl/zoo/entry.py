@@ -18,11 +18,12 @@ from torchrl.envs import EnvBase
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.io import replace_folder
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
 from torchrl_etl.zoo.policy import make_policy
 
-__all__ = ["ENTRIES", "find", "load", "names", "read_card", "save_entry", "synergies"]
+__all__ = ["ENTRIES", "find", "load", "names", "read_card", "save_entry", "synergies", "untrained"]
 
 ENTRIES = Path(__file__).parent / "entries"
 """The folder of the entries that come with torchrl_etl."""
@@ -119,6 +120,39 @@ def load(
         env = _make_env(folder, card, device)
     _check_env(folder, card, EnvironmentSpec.of(env))
     return policy, env
+
+
+def untrained(
+    name: str | os.PathLike[str], *, device: torch.device | str | None = None
+) -> TensorDictModuleBase:
+    """What an entry's policy would do without training: its networks with weights drawn anew.
+
+    The decoder, where there is one, is the trained one; an entry does not hold the first weights of
+    its run.
+
+    Args:
+        name (str or path-like): an entry, see :func:`find`.
+
+    Keyword Args:
+        device (torch.device, optional): of the policy. Default: the CPU.
+
+    Raises:
+        ZooError: if there is no such entry, or it is damaged.
+
+    Examples:
+        >>> from torchrl_etl import zoo
+        >>> zoo.untrained("overactuated").in_keys
+        ['observation']
+    """
+    folder, card = find(name), read_card(name)
+    trained = _policy(folder, card)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        fresh = make_policy(**card.policy)
+    for drawn, learned in zip(fresh.modules(), trained.modules(), strict=True):
+        if isinstance(drawn, SynergyMap):
+            drawn.load_state_dict(learned.state_dict())
+    return fresh.to(device or "cpu")
 
 
 def synergies(name: str | os.PathLike[str]) -> Path:

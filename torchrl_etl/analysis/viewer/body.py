@@ -6,6 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_etl.analysis.viewer.framing import (
+    middle_and_size,
+    moving_bodies,
+    planes,
+    scenery,
+)
 from torchrl_etl.analysis.viewer.muscles import activations, colors, paths
 from torchrl_etl.extras import extra
 
@@ -76,12 +82,10 @@ class Body:
 
     def _add_geoms(self) -> Any:
         model, scene = self._model, self._server.scene
-        planes = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
-        touched = (model.geom_contype | model.geom_conaffinity) != 0
-        scenery = (model.geom_bodyid == 0) & ~touched & ~planes  # the walls of a room, say
+        flat = planes(model)
         opacity = _rgba(model, "geom")[:, 3]
-        shown = (model.geom_group < _SHOWN_GROUPS) & (opacity > 0) & ~scenery
-        for geom in np.flatnonzero(shown & planes):
+        shown = (model.geom_group < _SHOWN_GROUPS) & (opacity > 0) & ~scenery(model)
+        for geom in np.flatnonzero(shown & flat):
             scene.add_grid(
                 f"/world/plane{geom}",
                 infinite_grid=True,
@@ -91,11 +95,11 @@ class Body:
                 position=self._data.geom_xpos[geom],
                 wxyz=_quaternions(self._data.geom_xmat[geom][None])[0],
             )
-        for geom in np.flatnonzero(shown & ~planes & (opacity < 1)).tolist():
+        for geom in np.flatnonzero(shown & ~flat & (opacity < 1)).tolist():
             mesh, rgba = merge_geoms(model, [geom]), _rgba(model, "geom")[geom]
             yield self._add_flat(f"/world/geom{geom}", mesh, rgba), int(model.geom_bodyid[geom])
         for body in range(model.nbody):
-            own = shown & ~planes & (opacity == 1) & (model.geom_bodyid == body)
+            own = shown & ~flat & (opacity == 1) & (model.geom_bodyid == body)
             alike = group_geoms_by_visual_compat(model, np.flatnonzero(own).tolist())
             for number, geoms in enumerate(alike):
                 mesh = merge_geoms(model, geoms)
@@ -192,18 +196,11 @@ class Body:
         handle.batched_positions, handle.batched_wxyzs = positions, wxyzs
         handle.batched_scales, handle.batched_colors = scales, shades
 
-    def _moving(self) -> np.ndarray:
-        """Bodies that can move against the world, or are all there is."""
-        moving = np.flatnonzero(self._model.body_weldid != 0)
-        return moving if len(moving) else np.arange(self._model.nbody)
-
     def _root(self) -> int:
-        return int(self._moving()[0])
+        return int(moving_bodies(self._model)[0])
 
     def _place_camera(self) -> None:
-        places = self._data.xpos[self._moving()]
-        low, high = places.min(0), places.max(0)
-        middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.1)
+        middle, size = middle_and_size(self._model, self._data)
         self._radius = 0.003 * size
         if self._followed is not None:
             middle[:2] -= self._data.xpos[self._followed][:2]

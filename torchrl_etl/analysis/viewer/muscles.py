@@ -14,7 +14,7 @@ from torchrl_etl.modules import SynergyMap
 with extra("viewer"):
     import mujoco
 
-__all__ = ["Path", "activations", "colors", "driven_muscles", "paths"]
+__all__ = ["Path", "activations", "colors", "driven_muscles", "paths", "pulled_tendons"]
 
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -90,11 +90,7 @@ def paths(model: mujoco.MjModel, data: mujoco.MjData) -> Path:
     """Where tendons run now, around what they wrap; joints for what pulls at no tendon."""
     start, end, owner = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, int)]
     points, objects = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.reshape(-1)
-    pulled = {
-        int(model.actuator_trnid[i, 0]): i
-        for i in range(model.nu)
-        if model.actuator_trntype[i] == _TENDON
-    }
+    pulled = pulled_tendons(model)
     for tendon in range(model.ntendon):
         first, count = int(data.ten_wrapadr[tendon]), int(data.ten_wrapnum[tendon])
         here = np.arange(first, first + count - 1)
@@ -107,6 +103,15 @@ def paths(model: mujoco.MjModel, data: mujoco.MjData) -> Path:
     end.append(data.xanchor[joints])
     owner.append(motors)
     return Path(np.concatenate(start), np.concatenate(end), np.concatenate(owner))
+
+
+def pulled_tendons(model: mujoco.MjModel) -> dict[int, int]:
+    """By tendon, the actuator that pulls it."""
+    return {
+        int(model.actuator_trnid[i, 0]): i
+        for i in range(model.nu)
+        if model.actuator_trntype[i] == _TENDON
+    }
 
 
 def turned_joints(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,184 @@
+"""Moving pictures of a policy: what is in them, when they were taken, and what prevents them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensordict.nn import TensorDictModule
+
+from tests.commands import command
+from torchrl_etl import zoo
+from torchrl_etl.analysis.moving_pictures import side_by_side, write_moving_pictures
+from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
+from torchrl_etl.envs import make_env, mujoco_state
+from torchrl_etl.modules import SynergyMap
+from torchrl_etl.training import EpisodeRecorder, evaluate
+from torchrl_etl.training.evaluation import EVALUATION_SEED
+
+ELBOW = "myoElbowPose1D6MRandom-v0"
+
+
+class Blind:
+    """MuJoCo's renderer without GL: what would be drawn is in its scene; a picture is its size."""
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
+        self.model, self.scene = model, mujoco.MjvScene(model, 2000)
+        self.blank = np.zeros((height, width, 3), np.uint8)
+
+    def update_scene(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
+        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+        option = mujoco.MjvOption()
+        mujoco.mjv_updateScene(
+            self.model, data, option, mujoco.MjvPerturb(), camera, everything, self.scene
+        )
+
+    def render(self) -> np.ndarray:
+        return self.blank
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env(ELBOW)
+
+
+@pytest.fixture
+def recorder(env, monkeypatch):
+    monkeypatch.setattr(mujoco, "Renderer", Blind)
+    return EpisodeRecorder(env, size=(16, 20), seconds=0.3)
+
+
+@pytest.fixture(scope="module")
+def flexing(env):
+    """A policy that pulls at all muscles."""
+
+    def pull(observation):
+        return observation.new_ones((*observation.shape[:-1], env.action_spec.shape[-1]))
+
+    return TensorDictModule(pull, ["observation"], ["action"])
+
+
+def test_tendons_have_the_colours_of_their_muscles_activations(recorder, env, flexing):
+    recorder.record(flexing, 1)
+    model, data = mujoco_state(env)
+    tendon = int(mujoco.mjtObj.mjOBJ_TENDON)
+    scene = recorder._renderer.scene
+    drawn = [geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == tendon]
+    expected = colors(activations(model, data)) / 255
+    pulled = pulled_tendons(model)
+    assert {geom.objid for geom in drawn} >= pulled.keys()
+    for geom in drawn:
+        np.testing.assert_allclose(geom.rgba[:3], expected[pulled[geom.objid]], atol=1e-6)
+    assert (np.subtract(*expected.T[[0, 2]]) > 0.3).all(), "red, after 0.3 s of full excitation"
+
+
+def test_frames_are_25_to_a_simulated_second_and_the_first_and_the_last_are_there(
+    recorder, env, flexing
+):
+    (frames,) = recorder.record(flexing, 1)
+    assert frames.shape == (1 + 7 + 1, 16, 20, 3)  # at 0, 0.04 to 0.28, and 0.3 s
+    assert frames.dtype == np.uint8
+    assert mujoco_state(env)[1].time == pytest.approx(0.3, abs=0.03)
+
+
+def test_the_episodes_that_are_drawn_are_those_of_the_evaluation(recorder, env, flexing):
+    before = torch.get_rng_state()
+    recorder.record(flexing, 2)
+    drawn = mujoco_state(env)[1].qpos.copy()
+    steps = round(mujoco_state(env)[1].time / env._env.unwrapped.dt)
+    evaluate(flexing, env, episodes=2, max_steps=steps)
+    np.testing.assert_allclose(mujoco_state(env)[1].qpos, drawn)
+    evaluate(flexing, env, episodes=1, max_steps=steps, seed=EVALUATION_SEED)
+    assert not np.allclose(mujoco_state(env)[1].qpos, drawn), "goals and poses are drawn anew"
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_camera_keeps_the_hand_in_the_middle_and_the_room_out(recorder, env):
+    recorder.draw()
+    model, _ = mujoco_state(env)
+    scene = recorder._renderer.scene
+    kind = int(mujoco.mjtObj.mjOBJ_GEOM)
+    shown = {geom.objid for geom in scene.geoms[: scene.ngeom] if geom.objtype == kind}
+    bodies = model.geom_bodyid[sorted(shown)]
+    assert len(shown) and (bodies != 0).any()
+    untouched = (model.geom_contype | model.geom_conaffinity) == 0
+    assert not any(model.geom_bodyid[geom] == 0 and untouched[geom] for geom in shown)
+
+
+def test_a_camera_that_is_not_there_is_answered_with_those_that_are(env):
+    with pytest.raises(ValueError, match="no camera 'moon'; the model has none"):
+        EpisodeRecorder(env, camera="moon")
+
+
+def test_without_a_gl_library_the_packages_are_named(env, monkeypatch):
+    def refuse(*_):
+        raise OSError("libEGL.so.1 not found")
+
+    monkeypatch.setattr(mujoco, "Renderer", refuse)
+    with pytest.raises(RuntimeError, match=r"libEGL.so.1 not found.*libegl1, or libosmesa6"):
+        EpisodeRecorder(env)
+
+
+def test_a_video_and_an_animated_picture_show_the_same_and_nothing_else_is_left(tmp_path):
+    brightness = np.arange(0, 225, 25, dtype=np.uint8)[:, None, None, None]
+    episode = np.broadcast_to(brightness, (9, 16, 32, 3))
+    clips = [episode[:4], episode]
+    sides = {"before training": clips, "after training": clips[::-1]}
+    video, picture = write_moving_pictures(tmp_path / "videos", sides)
+    assert sorted(path.name for path in video.parent.iterdir()) == [picture.name, video.name][::-1]
+    with Image.open(picture) as image:
+        assert image.size == (2 * 2 * 32, 24 + 16)
+        assert image.n_frames == 5 and image.info["loop"] == 0  # every second; for ever
+    import imageio.v2 as imageio
+
+    decoded = imageio.mimread(video)
+    assert len(decoded) == 9 and decoded[0].shape == (40, 128, 3)
+    expected = list(side_by_side(sides))[-1]
+    assert np.abs(decoded[-1][24:].astype(int) - expected[24:]).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("video_episodes=0", "video_episodes"),
+        ("video_size=[2048,2048]", "which is more than 4096; choose fewer or smaller"),
+        ("video_seconds=0", "video_seconds"),
+        ("video_before=maybe", "video_before"),
+        ("video=1", "video"),
+    ],
+)
+def test_a_wrong_setting_is_one_sentence_before_anything_is_made(
+    setting, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert command("evaluate.py", "zoo=overactuated", setting) != 0
+    said = capsys.readouterr().err
+    assert words in said and said.startswith("Error: ") and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_without_a_body_is_said_before_the_evaluation(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    assert command("evaluate.py", "zoo=overactuated", "episodes=1", "video=true") != 0
+    assert "does not run on MuJoCo, so it cannot be drawn" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_untrained_entry_has_other_networks_and_the_same_synergies():
+    fresh, trained = zoo.untrained("overactuated"), zoo.load("overactuated")[0]
+    old, new = trained.state_dict(), fresh.state_dict()
+    of_decoder = next(
+        f"{name}." for name, part in fresh.named_modules() if isinstance(part, SynergyMap)
+    )
+    same = {key for key in new if torch.equal(new[key], old[key])}
+    assert same >= {key for key in new if key.startswith(of_decoder)}
+    weights = {key for key in new if key.endswith("weight") and not key.startswith(of_decoder)}
+    assert weights and not same & weights
+    again = zoo.untrained("overactuated").state_dict()
+    assert all(torch.equal(new[key], again[key]) for key in new)
