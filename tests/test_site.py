@@ -5,6 +5,7 @@ The build needs ``make docs``' environment, the browser test Chromium and Playwr
 
 from __future__ import annotations
 
+import html
 import importlib.util
 import re
 import shutil
@@ -34,6 +35,8 @@ PAGES = (
     "api/functional/",
     "api/objectives/",
 )
+# A list without an empty line before it, a role of reStructuredText, a link of Markdown.
+LEFT_OVER = re.compile(r"^\s*[-*] |`|\]\(|:(class|func|meth|mod|attr|math):|\.\. \w+::|::$")
 # Stands in for the script that draws diagrams, which the page fetches from elsewhere.
 MERMAID = """window.mermaid = {
     initialize() {},
@@ -90,8 +93,21 @@ def test_the_site_builds_strictly_and_shows_every_public_name(site):
     assert "transforms/#torchrl_etl.transforms.SynergyAction" in overview
     assert 'id="torchrl_etl.transforms.SynergyAction"' in transforms
     assert 'class="admonition deviates"' in transforms
-    shown = re.sub(r"<(pre|code|details)\b.*?</\1>", "", transforms, flags=re.DOTALL)
-    assert not re.search(r":(class|func|meth|math):|\.\. math::", shown)
+
+
+@pytest.mark.slow
+def test_no_markup_is_left_over_in_what_is_read(site):
+    left = []
+    for page in site.rglob("index.html"):
+        if page.relative_to(site).parts[0] == "source":
+            continue
+        prose = re.sub(
+            r"<(pre|code|script|style)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S
+        )
+        for line in html.unescape(re.sub(r"<[^>]+>", "", prose)).splitlines():
+            if LEFT_OVER.search(line):
+                left.append((page.relative_to(site).parent.as_posix(), line.strip()[:80]))
+    assert left == []
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from textwrap import indent
+from textwrap import dedent, indent
 from typing import Any
 
 import griffe
@@ -17,7 +17,11 @@ import griffe
 ROLE = re.compile(r":(?:class|func|meth|mod|attr):`(?:[^`<]*<)?(~?)([\w.]+)>?`")
 MATH = re.compile(r":math:`([^`]+)`")
 MATH_BLOCK = re.compile(r"^( *)\.\. math::(.*\n(?:(?:\1 +\S.*)?\n?)*)", re.MULTILINE)
-SECTION = re.compile(r"^( *)(Equation|Keys|Deviates):((?: .*)?(?:\n *\S.*)*)", re.MULTILINE)
+# To the end of its paragraph, and what is indented below.
+SECTION = re.compile(
+    r"^( *)(Equation|Keys|Deviates):((?: .*)?(?:\n *\S.*)*(?:\n+\1 +\S.*)*)", re.MULTILINE
+)
+LIST = re.compile(r"(^(?!- ).*\S)\n(- )", re.MULTILINE)
 CODE = re.compile(r"(``.*?``|`[^`]+`)")
 
 # Where a name is shown, and what it names.
@@ -107,12 +111,14 @@ def math_fence(found: re.Match) -> str:
 
 
 def section(found: re.Match) -> str:
-    """A section of this project as a paragraph or a box of its own."""
+    """A section of this project as paragraphs or a box of its own."""
     margin, name, body = found.groups()
-    body = "\n".join(line.strip() for line in body.strip().splitlines())
+    first, _, rest = body.partition("\n")
+    text = LIST.sub(r"\1\n\n\2", f"{first}\n{dedent(rest)}".strip())
     if name == "Deviates":
-        return indent('!!! deviates "Deviates from the paper"\n' + indent(body, " " * 4), margin)
-    return indent(f"**{name}:** {body}", margin)
+        text = indent(text[:1].upper() + text[1:], " " * 4)
+        return indent(f'!!! deviates "Deviates from the paper"\n{text}', margin)
+    return indent(f"**{name}:**" + ("\n\n" if text.startswith("- ") else " ") + text, margin)
 
 
 def link(target: str, brief: bool, thing: griffe.Object, shown: Places) -> str:

@@ -11,10 +11,11 @@ from markdown.util import AtomicString
 
 def inline(source: str, language: str, css_class: str, md: Any) -> ElementTree.Element:
     """``#!math x`` between backticks."""
-    formula = ElementTree.fromstring(convert(source, xmlns=""))
-    for part in formula.iter():
+    box = ElementTree.Element("span", {"class": css_class})
+    box.append(ElementTree.fromstring(convert(source, xmlns="")))
+    for part in box.iter():
         part.text = AtomicString(part.text or "")  # "*" is no emphasis here
-    return formula
+    return box
 
 
 def block(source: str, language: str, css_class: str, options: dict, md: Any, **rest: Any) -> str:

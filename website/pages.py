@@ -119,14 +119,19 @@ def reference(name: str, path: Path, names: list[str]) -> str:
 
 def overview() -> str:
     """All public names, by package."""
-    text = "# API reference\n\nAll public names; `import torchrl_etl` has those in bold, too.\n"
+    pages = documented()
     short = public_names(PACKAGE / "__init__.py")
-    for name, (path, names) in documented().items():
-        doc = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        links = (
-            f"[{'**' * (member in short)}`{member}`{'**' * (member in short)}]"
-            f"[torchrl_etl.{name}.{member}]"
-            for member in names
-        )
-        text += f"\n## [{name}]({name}.md)\n\n{doc.splitlines()[0]}\n\n{' · '.join(links)}\n"
+    homes = [(page, name) for page, (_, names) in pages.items() for name in names if name in short]
+    text = (
+        "# API reference\n\nAll public names, by package. What is asked for most is in "
+        f"`torchrl_etl`, too:\n\n{links(homes)}\n"
+    )
+    for page, (path, names) in pages.items():
+        summary = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n")
+        text += f"\n## [{page}]({page}.md)\n\n{summary[0]}\n\n"
+        text += links([(page, name) for name in names]) + "\n"
     return text
+
+
+def links(names: list[tuple[str, str]]) -> str:
+    return " · ".join(f"[`{name}`][torchrl_etl.{page}.{name}]" for page, name in names)
