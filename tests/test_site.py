@@ -92,6 +92,8 @@ def test_the_site_builds_strictly_and_shows_every_public_name(site):
     transforms = (site / "api" / "transforms" / "index.html").read_text(encoding="utf-8")
     assert "transforms/#torchrl_etl.transforms.SynergyAction" in overview
     assert 'id="torchrl_etl.transforms.SynergyAction"' in transforms
+    compose = (site / "compose" / "index.html").read_text(encoding="utf-8")
+    assert "transforms/#torchrl_etl.transforms.SynergyAction" in compose
     assert 'class="admonition deviates"' in transforms
 
 

@@ -1,7 +1,8 @@
 """MkDocs hooks: the pages that are not files of docs/, and links that hold on GitHub and here.
 
 README.md is the first page, CHANGELOG.md the last. Each package has a page of its public names,
-which mkdocstrings fills. A link to anything else in the repository leads to a page with its text.
+which mkdocstrings fills; other pages lead there from each name that they mention. A link to
+anything else in the repository leads to a page with its text.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ast
 import posixpath
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,15 @@ ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "torchrl_etl"
 MOVED = {ROOT / "README.md": "index.md", ROOT / "CHANGELOG.md": "changelog.md"}
 LINK = re.compile(r"(?<=\]\()([^)\s#]+)(#[^)\s]*)?(?=\))")
+# Code of one name; what may hold such a name and is left alone comes first.
+NAME = re.compile(
+    r"^```.*?^```|^#.*?$|\[[^\]]*\]\([^)]*\)|(?<!`)`([\w.]+)`(?!`)", re.DOTALL | re.MULTILINE
+)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".sh": "bash", ".toml": "toml"}
 
 
 def on_config(config: Any) -> Any:
+    documented.cache_clear()  # `mkdocs serve` builds more than once
     for entry in config.nav:
         if "API reference" in entry:
             entry["API reference"] = ["api/index.md", *(f"api/{name}.md" for name in documented())]
@@ -55,7 +62,24 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return found[0]
         return posixpath.relpath(uri_of(target), posixpath.dirname(uri)) + (found[2] or "")
 
-    return LINK.sub(relative, markdown)
+    markdown = LINK.sub(relative, markdown)
+    return markdown if uri.startswith(("api/", "source/")) else link_names(markdown)
+
+
+def link_names(markdown: str) -> str:
+    """Leads from the public names that a page mentions to the reference."""
+    known: dict[str, list[str]] = {}
+    for page, (_, names) in documented().items():
+        for name in names:
+            known[f"{page}.{name}"] = [f"torchrl_etl.{page}.{name}"]
+            if "_" in name or not name.islower():  # `embedding` is a key, too
+                known.setdefault(name, []).append(f"torchrl_etl.{page}.{name}")
+
+    def linked_name(found: re.Match) -> str:
+        places = known.get(found[1] or "", ())
+        return f"[{found[0]}][{places[0]}]" if len(places) == 1 else found[0]
+
+    return NAME.sub(linked_name, markdown)
 
 
 def uri_of(path: Path) -> str:
@@ -92,6 +116,7 @@ def source(path: Path) -> str:
     return head + f"``````{language}\n{path.read_text(encoding='utf-8')}\n``````\n"
 
 
+@cache
 def documented() -> dict[str, tuple[Path, list[str]]]:
     """Packages and modules that say what is public, by name, with their file and public names."""
     found = {}
