@@ -19,6 +19,7 @@ from torchrl_etl.training.evaluation import EVALUATION_SEED
 
 __all__ = ["EpisodeRecorder", "check_video_size"]
 
+_BACKDROP = [0.93, 0.94, 0.96, 1.0]
 _HIDDEN_GROUP = 5  # MuJoCo draws groups 0 to 2 unless it is told otherwise
 _MOST_PIXELS = 4096  # in either direction: what decoders of MP4 can be relied on to show
 
@@ -124,6 +125,8 @@ class EpisodeRecorder:
         if camera is None:
             around = scenery(model) | (planes(model) & (not self._follows))
             model.geom_group[around] = _HIDDEN_GROUP
+            light = model.vis.headlight  # the room's lamps leave with the room
+            light.active, light.ambient[:], light.diffuse[:] = 1, 0.4, 0.5
 
     def record(
         self, policy: TensorDictModuleBase, episodes: int, *, seed: int = EVALUATION_SEED
@@ -169,7 +172,24 @@ class EpisodeRecorder:
         for geom in self._tendons():
             if geom.objid in pulled:
                 geom.matid, geom.rgba[:3] = -1, shades[pulled[geom.objid]]
+                geom.emission = 0.5  # the colour is what is to be read, not its shading
+        if self._framed is not None and not self._follows:
+            self._add_backdrop()
         return self._renderer.render()
+
+    def _add_backdrop(self) -> None:
+        """A light wall behind the body in place of the room, so that dark tendons are seen."""
+        import mujoco  # there, since its model is
+
+        scene, eye = self._renderer.scene, self._renderer.scene.camera[0]
+        forward, up = np.array(eye.forward, float), np.array(eye.up, float)
+        frame = np.stack([np.cross(forward, up), up, -forward], 1)
+        far, box = 3 * self._framed.distance, int(mujoco.mjtGeom.mjGEOM_BOX)
+        wall = scene.geoms[scene.ngeom]
+        place, size = self._framed.lookat + far * forward, np.array([4 * far, 4 * far, 1e-3])
+        mujoco.mjv_initGeom(wall, box, size, place, frame.reshape(-1), np.float32(_BACKDROP))
+        wall.emission, wall.specular, wall.reflectance = 1.0, 0.0, 0.0
+        scene.ngeom += 1
 
     def _view(self) -> Any:
         """From the side, as the viewer begins; it goes with a body that walks away."""
@@ -179,7 +199,7 @@ class EpisodeRecorder:
             return self._framed
         middle, size = middle_and_size(self._model, self._data)
         view = self._framed = mujoco.MjvCamera()
-        view.lookat, view.distance, view.azimuth, view.elevation = middle, 1.2 * size, 132.0, -24.0
+        view.lookat, view.distance, view.azimuth, view.elevation = middle, 1.35 * size, 132.0, -24.0
         return view
 
     def _tendons(self) -> list[Any]:
