@@ -1,0 +1,62 @@
+"""A body moved by the synergies of a bundle one by one, as an animated picture.
+
+    python studies/moving_synergies.py runs/NAME/synergies docs/pictures [TASK]
+
+Each panel moves one synergy's coefficient through +1 and -1 while the others are 0: the bundle's
+first three, in its own order. No policy is at work. That of the README is of the bundle of
+
+    python recipes/etl_sac.py env=myoHandPenTwirl stage=explore explore.frames=4000 seed=100
+
+on TASK myoHandPose.
+"""
+
+# ruff: noqa: E402  (MuJoCo chooses how it draws when it is first imported)
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_etl.gl_backend import draw_without_display
+
+draw_without_display()
+from torchrl_etl.analysis.moving_pictures import FPS, write_moving_pictures
+from torchrl_etl.analysis.viewer import Session
+from torchrl_etl.command_line import one_sentence
+from torchrl_etl.opened import open_bundle
+from torchrl_etl.training import EpisodeRecorder
+
+SHOWN = 3
+SECONDS = 2.0
+SIZE = (180, 212)  # pixels of a panel
+
+
+def main(bundle: str, folder: str, task: str | None = None) -> None:
+    with one_sentence(ValueError, OSError, RuntimeError):
+        session = Session(open_bundle(Path(bundle), task))
+        session.model.site_rgba[:, 3] = 0.0  # goals of the task, which nobody pursues here
+        with EpisodeRecorder(session.env, size=SIZE) as recorder:
+            number = min(SHOWN, len(session.coefficients))
+            sides = {
+                f"synergy {synergy + 1}": [moved(session, recorder, synergy)]
+                for synergy in range(number)
+            }
+        for path in write_moving_pictures(Path(folder), sides, "moving_synergies"):
+            print(path)
+
+
+def moved(session: Session, recorder: EpisodeRecorder, synergy: int) -> np.ndarray:
+    session.reset(0)
+    session.center()
+    frames = []
+    for now in np.arange(0, SECONDS, 1 / FPS):
+        session.move(synergy, float(np.sin(2 * np.pi * now / SECONDS)))
+        session.advance(1 / FPS, patience=10.0)
+        frames.append(recorder.draw())
+    return np.stack(frames)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
