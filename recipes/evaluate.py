@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 
 import hydra
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
 
 from torchrl_etl.gl_backend import draw_without_display
 
 if "video=true" in map(str.lower, sys.argv[1:]):
     draw_without_display()
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
 from torchrl_etl import zoo
 from torchrl_etl.analysis.moving_pictures import write_moving_pictures
 from torchrl_etl.checks import check_flag, check_integer, check_real
