@@ -195,5 +195,5 @@ def test_bad_arguments_are_named_before_anything_is_started(change, message):
 
 def test_without_ray_the_message_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ImportError, match="pip install 'ray"):
+    with pytest.raises(ImportError, match=r"pip install 'torchrl_etl\[ray"):
         RayWorkers(make_batched_env, synergy_policy(), num_workers=1, frames_per_batch=8)
