@@ -80,8 +80,9 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[Experiment]:
     """The runs that the configuration asks for, of which there are several with ``seeds``."""
     if config.resume is not None:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
+        defaults = hydra.compose("config")
         for folder in map(Path, folders):
-            stored = resumed_config(folder, given, defaults=hydra.compose("config"))
+            stored = resumed_config(folder, given, defaults=defaults)
             yield Experiment(stored, resume=folder, say=print)
         return
     # Two runs that begin in the same second have the same name by default.

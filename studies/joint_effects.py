@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from body_synergies import body_decoder, muscle_changes
 from omegaconf import DictConfig
+from rows import append
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -117,15 +118,6 @@ def known_tasks(out: Path) -> set[str]:
         return set()
     with out.open(newline="", encoding="utf-8") as file:
         return {row["task"] for row in csv.DictReader(file)}
-
-
-def append(out: Path, row: dict[str, Any]) -> None:
-    fresh = not out.exists()
-    with out.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, row, lineterminator="\n")
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":

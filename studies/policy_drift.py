@@ -12,12 +12,11 @@ changes in K more updates on the same transitions. Rows are appended.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
+from rows import append
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data.tensor_specs import ContinuousBox
@@ -86,15 +85,6 @@ def measured(stage: Stage, space: ContinuousBox) -> dict[str, float]:
 
 def size(values: Tensor) -> float:
     return values.square().mean().sqrt().item()
-
-
-def append(out: Path, row: dict[str, Any]) -> None:
-    fresh = not out.exists()
-    with out.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, row, lineterminator="\n")
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import runpy
 import sys
+from types import ModuleType
 
 from pytest import MonkeyPatch
 
@@ -28,3 +30,11 @@ def command(recipe: str, *arguments: str) -> int:
                 return 1
             return left.code or 0
     return 0
+
+
+def recipe_module(name: str) -> ModuleType:
+    """``recipes/NAME.py`` as a module, for what it says without being run."""
+    spec = importlib.util.spec_from_file_location(f"{name}_recipe", ROOT / "recipes" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

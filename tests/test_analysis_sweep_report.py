@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 from PIL import Image
 
+from tests.commands import recipe_module
 from tests.sweep_rows import FEW, run, sweep, write
 from torchrl_etl.analysis.published import caveats, published_curves
 from torchrl_etl.analysis.sweep_pictures import _PUBLISHED, looks, overall_picture, task_picture
 
 
 def report(*arguments):
-    path = Path(__file__).parent.parent / "recipes" / "report.py"
-    spec = importlib.util.spec_from_file_location("report", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.main([*arguments, f"repetitions={FEW}"])
+    recipe_module("report").main([*arguments, f"repetitions={FEW}"])
 
 
 def test_looks_are_distinct_and_never_the_published_grey():

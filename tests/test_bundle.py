@@ -262,7 +262,7 @@ def test_a_bundle_of_a_decoder_that_is_not_finite_is_refused(tmp_path, monkeypat
     with torch.no_grad():
         next(decoder.parameters()).view(-1)[0] = float("nan")
     with monkeypatch.context() as patch:  # releases before saved it
-        patch.setattr("torchrl_etl.synergies.bundle._not_finite", lambda state: None)
+        patch.setattr("torchrl_etl.synergies.bundle.not_finite", lambda state: None)
         save_bundle(decoder, tmp_path / "own", task="toy", actuators=["a", "b", "c"])
     with pytest.raises(BundleError, match="not finite: its training diverged before it was saved"):
         load_bundle(tmp_path / "own")

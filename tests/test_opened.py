@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import signal
@@ -15,6 +14,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from tests.commands import recipe_module
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.analysis.viewer.page import Page, check_port
@@ -130,10 +130,7 @@ def test_what_is_no_port_is_refused(port):
 
 @pytest.fixture(scope="module")
 def recipe():
-    spec = importlib.util.spec_from_file_location("view", ROOT / "recipes" / "view.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return recipe_module("view")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import os
 import signal
 import subprocess
@@ -15,6 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
+from tests.commands import recipe_module
 from tests.configs import CONF, ROOT, TINY
 from torchrl_etl.analysis.sweep_results import COLUMNS
 from torchrl_etl.training import Run, Sweep
@@ -188,8 +188,4 @@ def test_a_misspelt_setting_is_answered_with_the_nearest(tmp_path):
 
 @pytest.fixture(scope="module")
 def recipe():
-    """recipes/sweep.py as a module."""
-    spec = importlib.util.spec_from_file_location("sweep_recipe", ROOT / "recipes" / "sweep.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return recipe_module("sweep")

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+
+from torch import Tensor
 
 __all__ = [
     "check_choice",
@@ -19,6 +21,7 @@ __all__ = [
     "check_real",
     "check_sizes",
     "naming",
+    "not_finite",
 ]
 
 
@@ -147,3 +150,14 @@ def check_flag(**values: object) -> None:
 
 def _is_integer(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def not_finite(state: Mapping[str, Tensor]) -> str | None:
+    """The first entry that holds NaN or infinity, if any.
+
+    Examples:
+        >>> import torch
+        >>> not_finite({"weight": torch.ones(2), "bias": torch.tensor([1.0, torch.nan])})
+        'bias'
+    """
+    return next((key for key, value in state.items() if not value.isfinite().all()), None)

@@ -12,7 +12,7 @@ from torchrl.checkpoint import Checkpoint
 
 from torchrl_etl import zoo
 from torchrl_etl.analysis.viewer import Subject
-from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
+from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.methods.etl import ETL
@@ -20,7 +20,7 @@ from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
-from torchrl_etl.training.evaluation import EVALUATION_SEED
+from torchrl_etl.training.evaluation import EVALUATION_SEED, longest_episode
 from torchrl_etl.training.resumed import resumed_config
 
 __all__ = ["open_bundle", "open_run", "open_zoo"]
@@ -39,15 +39,13 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
         ValueError: if the folder holds no run, or nothing yet that would move a body.
     """
     experiment = Experiment(resumed_config(run, ["device=cpu"], defaults=defaults), resume=run)
-    context, config = experiment.context, experiment.config
-    steps = config.env_kwargs.get("max_episode_steps")
-    steps = steps or episode_length(config.env, config.goal) or 1000
+    context = experiment.context
     subject = Subject(
         str(run),
         experiment.task,
         lambda goal: context.make_env(goal=goal),
         context.spec.actuators,
-        episode_steps=math.ceil(steps / config.action_repeat),
+        episode_steps=math.ceil(longest_episode(context.task) / context.config.action_repeat),
         first_seed=EVALUATION_SEED,
     )
     subject = _with_explorer(_with_policy(subject, experiment), experiment)
@@ -108,8 +106,6 @@ def open_zoo(name: str) -> Subject:
     env.close()
     of_task = dict(card.task)
     built, goal = of_task.pop("name"), of_task.pop("goal", None)
-    limit = (of_task.get("env_kwargs") or {}).get("max_episode_steps")
-    limit = limit or episode_length(built, goal) or 1000
     return Subject(
         f"zoo={name}",
         resolve_task(built, goal),
@@ -117,7 +113,7 @@ def open_zoo(name: str) -> Subject:
         card.actuators,
         decoder=next((part for part in policy.modules() if isinstance(part, SynergyMap)), None),
         policy=policy,
-        episode_steps=math.ceil(limit / of_task.get("action_repeat", 1)),
+        episode_steps=math.ceil(longest_episode(card.task) / of_task.get("action_repeat", 1)),
         first_seed=EVALUATION_SEED,
     )
 

@@ -121,9 +121,9 @@ class SideBySide:
         """
         objectives = [learner.objective for learner in self.learners]
         # Stacked anew each time: gradients then flow back to the learners' own parameters.
-        stacked = torch.stack([TensorDict.from_module(each) for each in objectives])
-        held = [stacked.pop(path) for path in self._holders]
-        rest = dict(stacked.flatten_keys(".").items())
+        params = torch.stack([TensorDict.from_module(each) for each in objectives])
+        held = [params.pop(path) for path in self._holders]
+        rest = dict(params.flatten_keys(".").items())
         first, draws = objectives[0], inputs["draws"]
         order = [draws[f"{i}"] for i in range(len(draws.keys()))]
 

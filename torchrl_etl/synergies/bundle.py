@@ -22,6 +22,7 @@ import torch
 from safetensors import SafetensorError
 from tensordict.utils import NestedKey
 
+from torchrl_etl.checks import not_finite
 from torchrl_etl.io import replace_folder, surviving_folder
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies.bundle_info import (
@@ -102,7 +103,7 @@ def save_bundle(
     if encoder is not None:
         state |= {f"{_ENCODER}{key}": value for key, value in encoder.state_dict().items()}
         num_components = encoder.num_components if num_components is None else num_components
-    if (bad := _not_finite(state)) is not None:
+    if (bad := not_finite(state)) is not None:
         raise BundleError(
             f"{bad} of the decoder is not finite, so it has no synergies to save; its training "
             "diverged: lower the learning rate or look for NaN in the actions it was fitted to."
@@ -192,7 +193,7 @@ def load_bundle(
             f"{_TENSORS} in {str(folder)!r} is not a safetensors file ({error}); write bundles "
             "with save_bundle."
         ) from error
-    if (bad := _not_finite(state)) is not None:
+    if (bad := not_finite(state)) is not None:
         raise BundleError(
             f"{bad} of the decoder in {str(folder)!r} is not finite: its training diverged before "
             "it was saved; explore again, or take another bundle."
@@ -266,11 +267,6 @@ def bundle_files(path: str | os.PathLike[str]) -> dict[str, bytes]:
     load_bundle(path)
     folder = _find_folder(Path(path))
     return {name: (folder / name).read_bytes() for name in BUNDLE_FILES}
-
-
-def _not_finite(state: Mapping[str, torch.Tensor]) -> str | None:
-    """The first entry that holds NaN or infinity."""
-    return next((key for key, value in state.items() if not value.isfinite().all()), None)
 
 
 def _plain(value: Any, where: str) -> Any:

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_etl.analysis import Interval, interval, success_interval
 from torchrl_etl.envs import episode_length, resolve_task
 
-__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate", "evaluate_task"]
+__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate", "evaluate_task", "longest_episode"]
 
 EVALUATION_SEED = 10_000_000
 """Seed of the first evaluation episode; training seeds start at 2**30."""
@@ -138,13 +138,25 @@ def evaluate_task(
         >>> len(evaluate_task(policy, env, zoo.read_card("overactuated").task, episodes=2).returns)
         2
     """
-    name, goal = task["name"], task.get("goal")
-    steps = (task.get("env_kwargs") or {}).get("max_episode_steps")
     return evaluate(
         policy,
         env,
         episodes=episodes,
-        max_steps=steps or episode_length(name, goal) or 1000,
+        max_steps=longest_episode(task),
         action_repeat=task.get("action_repeat", 1),
-        solved_steps=resolve_task(name, goal).solved_steps,
+        solved_steps=resolve_task(task["name"], task.get("goal")).solved_steps,
     )
+
+
+def longest_episode(task: Mapping[str, Any]) -> int:
+    """Steps of the simulator after which an episode ends; 1,000 where the task does not say.
+
+    Args:
+        task (mapping): see :func:`evaluate_task`.
+
+    Examples:
+        >>> longest_episode({"name": "overactuated"})
+        25
+    """
+    steps = (task.get("env_kwargs") or {}).get("max_episode_steps")
+    return steps or episode_length(task["name"], task.get("goal")) or 1000

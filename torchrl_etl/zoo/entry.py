@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.io import replace_folder
 from torchrl_etl.modules import SynergyMap
@@ -240,8 +240,7 @@ def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
 def _fill(
     folder: Path, policy: TensorDictModuleBase, state: dict[str, torch.Tensor]
 ) -> TensorDictModuleBase:
-    broken = next((key for key, value in state.items() if not value.isfinite().all()), None)
-    if broken is not None:
+    if (broken := not_finite(state)) is not None:
         raise ZooError(
             f"{broken} of the policy for {folder} is not finite: its training diverged, so use one "
             "of a run that did not."
