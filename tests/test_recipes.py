@@ -1,4 +1,8 @@
-"""The recipes as a person runs them: in a process, on real muscles, with typos."""
+"""The recipes as a person runs them: on real muscles, with typos, and in a process of their own.
+
+What is printed and what is left is the same in a process of its own and in this one (see
+:func:`command`), which has imported everything; so few tests start one.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.commands import command
 from tests.configs import ROOT, TINY
 from torchrl_etl.command_line import quote_paths
 from torchrl_etl.synergies import load_bundle, save_bundle
@@ -20,13 +25,13 @@ from torchrl_etl.synergies import load_bundle, save_bundle
 SMALL = [override for override in TINY if not override.startswith("env=")]
 
 
-def run(recipe: str, *overrides: str, cwd: Path, seconds: int = 240) -> subprocess.CompletedProcess:
+def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
         capture_output=True,
         text=True,
         cwd=cwd,
-        timeout=seconds,
+        timeout=240,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
 
@@ -35,7 +40,7 @@ def run(recipe: str, *overrides: str, cwd: Path, seconds: int = 240) -> subproce
 def hand(tmp_path_factory) -> Path:
     """A smoke run of both stages on a MyoSuite hand, with pictures, in a path with a space."""
     folder = tmp_path_factory.mktemp("with a space") / "a run"
-    done = run(
+    done = process(
         "etl_sac.py",
         *SMALL,
         "env=myoHandPose",
@@ -78,18 +83,17 @@ def test_a_run_leaves_everything_behind(hand):
 
 
 @pytest.mark.slow
-def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand):
-    done = run("evaluate.py", f"run='{hand}'", "episodes=2", cwd=hand.parent)
-    assert done.returncode == 0, done.stderr
+def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, capsys):
+    assert command("evaluate.py", f"run='{hand}'", "episodes=2") == 0
     result = json.loads((hand / "evaluation.json").read_text())
     summary = json.loads((hand / "summary.json").read_text())
     assert result["return"]["mean"] == pytest.approx(summary["learn"]["return"]["after"])
-    assert "95% interval" in done.stdout
+    assert "95% interval" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_evaluate_draws_a_video_or_says_what_to_install(hand):
-    done = run(
+    done = process(
         "evaluate.py",
         f"run='{hand}'",
         "episodes=1",
@@ -110,16 +114,8 @@ def test_evaluate_draws_a_video_or_says_what_to_install(hand):
 def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
     decoder, info = load_bundle(hand)  # saved again, as anybody can, without a fact about it
     bundle = save_bundle(decoder, tmp_path / "own", task=info.task, actuators=info.actuators)
-    done = run(
-        "etl_sac.py",
-        *SMALL,
-        "env=myoHandKeyTurn",
-        "stage=learn",
-        f"synergies='{bundle}'",
-        f"run_dir='{tmp_path}/run'",
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
+    settings = ("env=myoHandKeyTurn", "stage=learn", f"synergies='{bundle}'")
+    assert command("etl_sac.py", *SMALL, *settings, f"run_dir='{tmp_path}/run'") == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["synergies"]["task"] == "myoHandPoseFixed-v0"
     assert summary["learn"]["frames_charged"] == summary["learn"]["frames"]
@@ -127,17 +123,11 @@ def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_p
 
 
 @pytest.mark.slow
-def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
-    done = run(
-        "etl_sac.py",
-        *SMALL,
-        "env=humanoid-stand",
-        f"synergies='{hand}'",
-        f"run_dir='{tmp_path}/run'",
-        cwd=tmp_path,
-    )
-    assert done.returncode == 2
-    assert done.stderr.startswith("Error: ") and "Traceback" not in done.stderr
+def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path, capsys):
+    settings = ("env=humanoid-stand", f"synergies='{hand}'")
+    assert command("etl_sac.py", *SMALL, *settings, f"run_dir='{tmp_path}/run'") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("Error: ") and said.count("\n") == 1
 
 
 @pytest.mark.slow
@@ -145,10 +135,8 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path):
     "options", ["env=Walker2d-v5", "faithful=paper", "learn.decoder.residual=0.2"]
 )
 def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path):
-    done = run("etl_sac.py", *TINY, *options.split(), f"run_dir='{tmp_path}/run'", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    done = run("evaluate.py", f"run='{tmp_path}/run'", "episodes=2", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert command("etl_sac.py", *TINY, options, f"run_dir='{tmp_path}/run'") == 0
+    assert command("evaluate.py", f"run='{tmp_path}/run'", "episodes=2") == 0
 
 
 @pytest.mark.parametrize(
@@ -181,19 +169,33 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],
 )
-def test_a_typo_gets_the_nearest_right_word_and_no_traceback(recipe, override, words, tmp_path):
-    done = run(recipe, override, cwd=tmp_path)
+def test_a_typo_gets_the_nearest_right_word(recipe, override, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert command(recipe, override) != 0
+    assert words in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("recipe", "override", "words"),
+    [
+        ("etl_sac.py", "env=myoHandPos", "myoHandPose"),
+        ("evaluate.py", "run=no (where)", "holds no run"),
+        ("sweep.py", "metods=[sac]", "did you mean methods"),
+    ],
+)
+def test_a_process_ends_with_that_sentence_and_no_traceback(recipe, override, words, tmp_path):
+    done = process(recipe, override, cwd=tmp_path)
     assert done.returncode != 0
     assert words in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_former_presets_and_null_still_mean_the_defaults(tmp_path):
+def test_former_presets_and_null_still_mean_the_defaults(capsys):
     former = ("learner=residual", "experiment=laptop", "faithful=null", "env=myoHandPos")
-    done = run("etl_sac.py", *former, cwd=tmp_path)
-    assert "myoHandPose" in done.stderr, "only the task is wrong"
-    assert "Traceback" not in done.stderr
+    assert command("etl_sac.py", *former) == 2
+    assert "myoHandPose" in capsys.readouterr().err, "only the task is wrong"
 
 
 def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
@@ -226,18 +228,18 @@ def test_a_tilde_is_the_home_folder(monkeypatch):
     ]
 
 
-def test_help_explains_the_settings(tmp_path):
-    done = run("etl_sac.py", "--help", cwd=tmp_path)
-    assert done.returncode == 0
+def test_help_explains_the_settings(capsys):
+    assert command("etl_sac.py", "--help") == 0
+    said = capsys.readouterr().out
     for word in ("stage", "synergies", "faithful", "experiment", "resume"):
-        assert word in done.stdout
+        assert word in said
 
 
 @pytest.mark.slow
 def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     arguments = [*TINY, "explore.frames=100000", f"run_dir='{folder}'"]
-    process = subprocess.Popen(
+    running = subprocess.Popen(
         [sys.executable, str(ROOT / "recipes" / "etl_sac.py"), *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -247,11 +249,11 @@ def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
     )
     deadline = time.monotonic() + 120
     while not list(folder.glob("checkpoints/explore/*/seal.json")):
-        assert process.poll() is None and time.monotonic() < deadline
+        assert running.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 130
+    running.send_signal(signal.SIGINT)
+    output, _ = running.communicate(timeout=60)
+    assert running.returncode == 130
     assert f"resume={folder}" in output
     assert "Traceback" not in output
 
@@ -259,5 +261,5 @@ def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_both_stages_run_on_cuda(tmp_path):
-    done = run("etl_sac.py", *TINY, "device=cuda", f"run_dir='{tmp_path}/run'", cwd=tmp_path)
+    done = process("etl_sac.py", *TINY, "device=cuda", f"run_dir='{tmp_path}/run'", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

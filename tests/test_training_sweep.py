@@ -179,13 +179,6 @@ def test_a_queue_takes_a_task_of_one_s_own_and_its_random_goal(recipe, tmp_path,
     assert random.path.name == "queue_tasks-QueueReachRandom-v0-random-sac-seed0"
 
 
-def test_a_misspelt_setting_is_answered_with_the_nearest(tmp_path):
-    arguments = command(tmp_path / "out", "metods=[sac]")
-    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 1 and "did you mean methods" in ended.stderr
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.fixture(scope="module")
 def recipe():
     return recipe_module("sweep")
