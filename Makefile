@@ -1,7 +1,8 @@
 # make demo: both stages of ETL on a MyoSuite hand, in a few minutes.
 # make test: the whole test suite, in the same environment.
 # make docs: the documentation site, into site/; opens with any static server.
-# make bench: speed and memory beside their peers, into docs/performance.md; under 20 minutes.
+# make bench: speed and memory beside their peers, into docs/performance.md; under 25 minutes.
+#   ONLY="update end_to_end" runs these parts.
 # make smoke: both stages on each of the paper's 13 tasks, for as long as it takes to see them run.
 
 PYTHON ?= python3
@@ -28,9 +29,9 @@ smoke: $(VENV)/.complete
 	done
 
 bench: $(VENV)/.complete .venv-peers/.complete
-	$(BIN)/python benchmarks/bench.py --peer .venv-peers/bin/python --write
+	$(BIN)/python benchmarks/bench.py --write $(if $(ONLY),--only $(ONLY))
 
-# Stable-Baselines3 lives apart: it may want other versions than we do.
+# Stable-Baselines3 and SBX live apart: they may want other versions than we do.
 .venv-peers/.complete: benchmarks/peers.lock
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --no-deps -r benchmarks/peers.lock

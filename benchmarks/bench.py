@@ -2,31 +2,40 @@
 
 python benchmarks/bench.py                       # all, as JSON lines
 python benchmarks/bench.py --only collection     # one of them
-python benchmarks/bench.py --write               # and the table in docs, and the CSV beside it
+python benchmarks/bench.py --write               # and into the page, and the lines beside it
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from peers import PYTHON, peer_python
+
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "performance.md"
-CSV = HERE.parent / "docs" / "results" / "performance.csv"
-NAMES = ("collection", "update", "end_to_end", "transforms", "memory")
-OPTIONS = {"update": ["--compile", "--repeats", "5"]}
+LINES = HERE.parent / "docs" / "results" / "performance.jsonl"
+OPTIONS: dict[str, list[str]] = {
+    "collection": [],
+    "update": ["--compile", "--repeats", "5"],
+    "end_to_end": [],
+    "transforms": [],
+    "memory": [],
+}
+WITH_PEERS = ("update", "end_to_end")
 BEGIN, END = "<!-- table: make bench -->\n", "<!-- end of table -->\n"
+Row = dict[str, Any]
 
 
-def run(name: str, peer: str | None) -> list[dict[str, Any]]:
-    command = [sys.executable, str(HERE / f"{name}.py"), *OPTIONS.get(name, [])]
-    if peer and name == "end_to_end":
+def run(name: str, peer: str | Path) -> list[Row]:
+    command = [sys.executable, HERE / f"{name}.py", *OPTIONS[name]]
+    if name in WITH_PEERS:
         command += ["--peer", peer]
     rows = []
     # Each benchmark decides on its own threads.
@@ -41,26 +50,26 @@ def run(name: str, peer: str | None) -> list[dict[str, Any]]:
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| benchmark | case | median | ± | unit | ratio | to |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def table(rows: Iterable[Row]) -> str:
+    lines = ["| benchmark | case | median | ± | unit | ratio to |", "|---|---|---|---|---|---|"]
     for row in rows:
         figures = f"{row['median']:,.4g} | {row['spread']:.2g} | {row['unit']}"
-        ratio = f"{row['ratio']:.2f} ± {row['ratio_spread']:.2f}" if "ratio" in row else ""
-        peer = row.get("peer", "")
-        if peer and row["case"].rsplit("/", 1)[-1] == peer:
-            ratio, peer = "", ""
-        lines.append(f"| {row['benchmark']} | `{row['case']}` | {figures} | {ratio} | {peer} |")
+        ratios = [
+            f"{ratio:.2f} ± {spread:.2f} `{name}`"
+            for name, (ratio, spread) in row.get("ratios", {}).items()
+        ]
+        case = f"| {row['benchmark']} | `{row['case']}` |"
+        lines.append(f"{case} {figures} | {'<br>'.join(ratios)} |")
     return "\n".join(lines) + "\n"
 
 
-def write(rows: list[dict[str, Any]]) -> None:
-    with CSV.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
-        writer.writeheader()
-        writer.writerows(rows)
+def written() -> list[Row]:
+    """The rows of the last runs."""
+    return [json.loads(text) for text in LINES.read_text(encoding="utf-8").splitlines()]
+
+
+def write(rows: list[Row]) -> None:
+    LINES.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
     page = PAGE.read_text(encoding="utf-8")
     before, rest = page.split(BEGIN)
     PAGE.write_text(before + BEGIN + table(rows) + END + rest.split(END)[1], encoding="utf-8")
@@ -68,28 +77,18 @@ def write(rows: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES)
-    parser.add_argument("--peer", help="Python with stable-baselines3")
+    parser.add_argument("--only", nargs="+", choices=OPTIONS, default=list(OPTIONS))
+    parser.add_argument("--peer", default=PYTHON, help="Python of the peers, or none")
     parser.add_argument("--write", action="store_true")
     arguments = parser.parse_args()
+    if set(arguments.only) & set(WITH_PEERS):
+        peer_python(arguments.peer)
     rows = []
     for name in arguments.only:
         rows += run(name, arguments.peer)
-    if arguments.write:
-        kept = []
-        if CSV.exists():  # what was not run now stays
-            with CSV.open(encoding="utf-8") as file:
-                kept = [
-                    row for row in csv.DictReader(file) if row["benchmark"] not in arguments.only
-                ]
-        write(
-            sorted([*map(as_numbers, kept), *rows], key=lambda row: NAMES.index(row["benchmark"]))
-        )
-
-
-def as_numbers(row: dict[str, str]) -> dict[str, Any]:
-    numbers = ("median", "spread", "ratio", "ratio_spread")
-    return {k: float(v) if k in numbers else v for k, v in row.items() if v != ""}
+    if arguments.write:  # what was not run now stays
+        kept = [row for row in written() if row["benchmark"] not in arguments.only]
+        write(sorted([*kept, *rows], key=lambda row: list(OPTIONS).index(row["benchmark"])))
 
 
 if __name__ == "__main__":

@@ -154,8 +154,7 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
             f"{task}/{stage}/{name}",
             "frames/s",
             values[name],
-            peer="simulator",
-            peer_values=values["simulator"],
+            peers={"simulator": values["simulator"]},
             workers=workers,
             num_envs=1 if name == "torchrl" else num_envs,
         )

@@ -9,15 +9,18 @@ from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
+import torch
 from hydra import compose, initialize_config_dir
+from machine import machine
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import SynergyDecoder, make_actor
+from torchrl_etl.training import Stage, alone
 from torchrl_etl.training.run_folder import facts
 
-__all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy"]
+__all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy", "train"]
 
 CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
@@ -41,6 +44,13 @@ def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
     )
     actor = make_actor(inputs, decoder.synergy_spec, out_key="synergy")
     return TensorDictSequential(actor, decoder)
+
+
+def train(stage: Stage, updates: int, at_once: int) -> None:
+    """So many updates by the way that training takes, as if frames had earned ``at_once`` each."""
+    for _ in range(max(1, updates // at_once)):
+        stage.progress.owed += at_once
+        alone(stage.learn())
 
 
 class Child:
@@ -95,11 +105,10 @@ def line(
     unit: str,
     values: list[float],
     *,
-    peer: str | None = None,
-    peer_values: list[float] | None = None,
+    peers: Mapping[str, list[float]] | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """Print and return one case: median, spread, and the median ratio to a peer round by round."""
+    """Print and return one case: median, spread, and the median ratio to each other, by rounds."""
     row = {
         "benchmark": benchmark,
         "case": case,
@@ -107,11 +116,16 @@ def line(
         "median": round(median(values), 4),
         "spread": round(spread(values), 4),
         "repeats": len(values),
-        **more,
     }
-    if peer_values is not None:
-        ratios = [mine / other for mine, other in zip(values, peer_values, strict=True)]
-        row |= {"peer": peer, "ratio": round(median(ratios), 3), "ratio_spread": spread(ratios)}
-        row["ratio_spread"] = round(row["ratio_spread"], 3)
-    print(json.dumps({**row, **facts()}), flush=True)
+    others = {name: each for name, each in (peers or {}).items() if each is not values}
+    if others:
+        row["ratios"] = {name: ratio(values, each) for name, each in others.items()}
+    row |= {"threads": torch.get_num_threads(), **more, **machine(), **facts()}
+    print(json.dumps(row), flush=True)
     return row
+
+
+def ratio(values: list[float], others: list[float]) -> list[float]:
+    """Median and spread of the ratios of one case to another, each within a round."""
+    ratios = [mine / other for mine, other in zip(values, others, strict=True)]
+    return [round(median(ratios), 3), round(spread(ratios), 3)]

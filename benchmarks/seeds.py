@@ -83,7 +83,7 @@ def main() -> None:
         more = {"seeds": arguments.seeds, "compile": arguments.compile}
         line("seeds", other, "ms", values[other], **more)
         mine = f"together/{name}"
-        line("seeds", mine, "ms", values[mine], peer=other, peer_values=values[other], **more)
+        line("seeds", mine, "ms", values[mine], peers={other: values[other]}, **more)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Our side of ``end_to_end.py``: a stage, or plain SAC, training in steps as told.
+"""Our side of end_to_end.py: a stage, or plain SAC, training as told.
 
-Reads a number of frames a line, trains for so many, and answers with the seconds that this took.
+Reads a number of seconds a line, trains for so long, and answers with the frames a second.
 """
 
 from __future__ import annotations
@@ -45,18 +45,19 @@ def main() -> None:
     stage = build(experiment, arguments.method)
     stage.restart_collection()
 
-    def train(frames: int) -> None:
-        goal = stage.frames + frames
-        while stage.frames < goal:
-            stage.collect()
-            alone(stage.learn())
+    def step() -> None:
+        stage.collect()
+        alone(stage.learn())
 
-    train(1000)
+    while not stage.progress.updates:
+        step()
     print("ready", flush=True)
     for line in sys.stdin:
-        begun = time.perf_counter()
-        train(int(line))
-        print(time.perf_counter() - begun, flush=True)
+        step()  # its frames may have been collected before
+        begun, before = time.perf_counter(), stage.frames
+        while time.perf_counter() - begun < float(line):
+            step()
+        print((stage.frames - before) / (time.perf_counter() - begun), flush=True)
     stage.close()
 
 

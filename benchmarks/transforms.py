@@ -64,8 +64,7 @@ def main() -> None:
             name,
             "us/step",
             values[name],
-            peer="bare",
-            peer_values=values["bare"],
+            peers={"bare": values["bare"]},
             num_envs=arguments.num_envs,
         )
 

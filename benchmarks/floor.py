@@ -1,0 +1,71 @@
+"""The floor of an update: the time of its matrix products alone.
+
+``torch.mm`` takes it for exactly the products of an update, each on tensors of its own, without a
+gradient where none is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import torch
+
+__all__ = ["floor", "products", "sac_products", "stage_products"]
+
+Shape = tuple[int, int, int]
+"""Rows, inner size and columns of a product."""
+
+
+def products(batch: int, widths: list[int], passes: str) -> Iterator[Shape]:
+    """Products of a perceptron's passes.
+
+    ``f``: forward; ``w``: gradient of its weights; ``h``: of its hidden layers, on the way there;
+    ``i``: of its input.
+    """
+    layers = list(pairwise(widths))
+    for kind in passes:
+        for index, (wide, narrow) in enumerate(layers):
+            if kind == "f":
+                yield batch, wide, narrow
+            elif kind == "w":
+                yield wide, batch, narrow
+            elif kind == "i" or index:
+                yield batch, narrow, wide
+
+
+def sac_products(batch: int, inputs: int, action: int, out: int, hidden: list[int]) -> list[Shape]:
+    """Twin critics on ``inputs`` + ``action``, an actor that emits ``out``."""
+    critic = [inputs + action, *hidden, 1]
+    shapes = list(products(batch, [inputs, *hidden, 2 * out], "ffwh"))
+    for _ in range(2):
+        shapes += products(batch, critic, "ffwhfh")  # target, regression, under the actor
+        shapes.append((batch, hidden[0], action))  # and its gradient at the action alone
+    return shapes
+
+
+def stage_products(cfg: Any, name: str, observation_dim: int, action_dim: int) -> list[Shape]:
+    d, batch, hidden = cfg.num_synergies, cfg[name].batch_size, list(cfg.actor.hidden)
+    body = list(cfg.synergies.hidden)
+    decoder = [d, *reversed(body), action_dim]
+    if name == "learn":
+        shapes = sac_products(batch, observation_dim, action_dim, d, hidden)
+        return shapes + list(products(batch, decoder, "ffwifwh"))  # s', s, Eq. 10
+    shapes = sac_products(batch, observation_dim + d, action_dim, action_dim, hidden)
+    shapes += products(batch, [observation_dim, *cfg.exploration.encoder.hidden, d], "fwhff")
+    shapes += products(batch, [action_dim, *body, d * (1 + 2 * d)], "fwh")
+    return shapes + list(products(d * batch, decoder, "fwi"))
+
+
+def floor(shapes: list[Shape]) -> Callable[[], object]:
+    operands = [
+        (torch.randn(rows, inner), torch.randn(inner, columns), torch.empty(rows, columns))
+        for rows, inner, columns in shapes
+    ]
+
+    def run() -> None:
+        for left, right, out in operands:
+            torch.mm(left, right, out=out)
+
+    return run

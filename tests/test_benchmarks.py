@@ -1,0 +1,102 @@
+"""What ``make bench`` reports: its page, its lines, the products it counts, its peers."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import pytest
+
+from tests.configs import ROOT
+from tests.stages import fill, method_stage
+
+FOLDER = ROOT / "benchmarks"
+NAMES = ("bench", "floor", "harness", "machine", "peers")
+
+
+@pytest.fixture(scope="module")
+def benchmarks() -> Iterator[SimpleNamespace]:
+    """Its modules, imported as its scripts import them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        modules = {name: __import__(name) for name in NAMES}
+        yield SimpleNamespace(**modules)
+        for name in modules:
+            sys.modules.pop(name)
+
+
+def test_the_tables_of_the_page_are_made_of_the_committed_lines(benchmarks):
+    bench = benchmarks.bench
+    page = bench.PAGE.read_text(encoding="utf-8")
+    assert bench.BEGIN + bench.table(bench.written()) + bench.END in page
+
+
+def test_a_line_has_the_ratios_to_others_within_each_round(benchmarks, capsys):
+    fast, slow = [1.0, 4.0, 3.0], [2.0, 8.0, 3.0]
+    peers = {"slow": slow, "fast": fast}
+    row = benchmarks.harness.line("update", "fast", "ms", fast, peers=peers, threads=1)
+    assert row["median"] == 3.0 and row["ratios"] == {"slow": [0.5, 0.125]}
+    assert row["threads"] == 1 and row["torch"] and row["load_at_start"] >= 0
+    assert json.loads(capsys.readouterr().out) == row
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [("fpu avx avx2 fma", (True, False, False, False)), ("avx2 amx_tile", (True, 0, 0, True))],
+)
+def test_a_line_tells_the_instructions_that_products_gain_from(
+    flags, expected, benchmarks, tmp_path
+):
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text(f"processor\t: 0\nmodel name\t: A CPU: new\nflags\t\t: {flags}\n\n")
+    facts = benchmarks.machine.machine(cpuinfo)
+    assert facts["cpu"] == "A CPU: new"
+    names = ("avx2", "avx512f", "avx512_bf16", "amx")
+    assert facts["cpu_flags"] == dict(zip(names, expected, strict=True))
+    assert not any(benchmarks.machine.machine(tmp_path / "none")["cpu_flags"].values())
+
+
+def test_the_floor_counts_the_products_of_a_perceptron(benchmarks):
+    products = benchmarks.floor.products(5, [2, 3, 1], "fwh")
+    forward, weights = [(5, 2, 3), (5, 3, 1)], [(2, 5, 3), (3, 5, 1)]
+    assert list(products) == [*forward, *weights, (5, 1, 3)]  # none to the input
+
+
+def test_updates_are_timed_as_training_makes_them(benchmarks):
+    stage = method_stage("sac")
+    fill(stage, 1)
+    stage.progress.owed = 0.0
+    benchmarks.harness.train(stage, 4, at_once=2)
+    stage.close()
+    assert stage.progress.updates == 4 and stage.progress.owed == 0
+
+
+def test_a_python_without_peers_is_told_what_installs_them(benchmarks, tmp_path):
+    peer_python = benchmarks.peers.peer_python
+    assert peer_python("none") is None
+    with pytest.raises(SystemExit, match=r"not a Python that runs; `make .venv-peers/.complete`"):
+        peer_python(tmp_path / "python")
+    bare = tmp_path / "bare"
+    bare.write_text(f'#!/bin/sh\nexec {sys.executable} -S -I "$@"\n')
+    bare.chmod(0o755)
+    with pytest.raises(SystemExit, match=r"has no stable_baselines3 and no sbx; `make .venv-peers"):
+        peer_python(bare)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("library", ["stable_baselines3", "sbx"])
+def test_a_peer_answers_with_its_versions_and_milliseconds(library, benchmarks):
+    try:
+        python = benchmarks.peers.peer_python(benchmarks.peers.PYTHON)
+    except SystemExit as error:
+        pytest.skip(str(error))
+    case = {"library": library, "updates_at_once": 2, "observation_dim": 3, "action_dim": 2}
+    case |= {"hidden": [4], "batch_size": 2, "transitions": 4}
+    command = [python, FOLDER / "peer_update.py", json.dumps(case)]
+    done = subprocess.run(command, input="2\n", capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    versions, answer = map(json.loads, done.stdout.splitlines())
+    assert answer["ms"] > 0 and ("jax" in versions) == (library == "sbx")
