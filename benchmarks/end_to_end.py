@@ -15,6 +15,7 @@ one environment, and once after a step of eight environments in processes (``sbx
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from functools import partial
@@ -34,71 +35,84 @@ OURS = {
 }
 BY_DEFAULT = ("sac", "etl_learn", "etl_explore")
 COLLECTORS = {1: "collector=single", 8: "collector=process"}  # by frames per update
+PEERS = {  # library, and its environments
+    "sbx": ("sbx", 1),
+    "sbx_8_envs": ("sbx", 8),
+    "stable_baselines3": ("stable_baselines3", 1),
+}
 
 
-def peer_options(frames_per_update: int) -> dict[str, list[str]]:
-    """Arguments of ``peer_training.py`` by the name of a case."""
-    sbx, stepwise = ["--library", "sbx"], str(max(1, 8 // frames_per_update))
+def peer_cases(frames_per_update: int) -> dict[str, tuple[str, int]]:
+    """Which of ``PEERS`` is measured with how many updates at a time, by the name of a case."""
     return {
-        "sbx": sbx,
-        "sbx_scanned": [*sbx, "--updates-at-once", "16"],
-        "sbx_8_envs": [*sbx, "--updates-at-once", stepwise, "--envs", "8"],
-        "stable_baselines3": ["--library", "stable_baselines3"],
+        "sbx": ("sbx", 1),
+        "sbx_scanned": ("sbx", 16),
+        "sbx_8_envs": ("sbx_8_envs", max(1, 8 // frames_per_update)),
+        "stable_baselines3": ("stable_baselines3", 1),
     }
 
 
 class Contender(Child):
     """A process that trains for as many seconds as it is told."""
 
-    def await_ready(self) -> None:
-        while self.answer() != "ready":
-            pass
+    def await_ready(self) -> str:
+        """Its versions, if it says them."""
+        lines = list(iter(self.answer, "ready"))
+        return next((line for line in lines if line.startswith("{")), "{}")
 
-    def frames_per_second(self, seconds: float) -> float:
-        return float(self.ask(seconds))
+    def frames_per_second(self, *order: float) -> float:
+        return float(self.ask(" ".join(map(str, order))))
 
 
-def commands(
-    task: str, frames_per_update: int, methods: list[str], python: Path | None
-) -> dict[str, list[str | Path]]:
-    common = ["--frames-per-update", str(frames_per_update)]
-    ours = [sys.executable, HERE / "training.py", "--env", task, *common]
-    every = {}
+def start_ours(task: str, frames_per_update: int, methods: list[str]) -> dict[str, Contender]:
+    script = [sys.executable, HERE / "training.py", "--env", task]
+    script += ["--frames-per-update", str(frames_per_update), "--method"]
+    layout = COLLECTORS[frames_per_update]
+    ours = {}
     for name in methods:
         method, *overrides = OURS[name]
-        every[name] = [*ours, "--method", method, COLLECTORS[frames_per_update], *overrides]
-    if python is not None:
-        peer = [python, HERE / "peer_training.py", "--env", resolve_task(task).env_id, *common]
-        for name, options in peer_options(frames_per_update).items():
-            every[name] = [*peer, *options]
-    return every
+        command = [*script, method, layout, *overrides]
+        ours[name] = Contender(command, stderr=subprocess.DEVNULL)
+    return ours
+
+
+def start_peers(task: str, python: Path | None) -> dict[str, Contender]:
+    peers = {}
+    for name, (library, envs) in PEERS.items() if python else ():
+        command = [python, HERE / "peer_training.py", "--env", resolve_task(task).env_id]
+        command += ["--library", library, "--envs", str(envs)]
+        peers[name] = Contender(command, stderr=subprocess.DEVNULL)
+    return peers
 
 
 def compare(
-    task: str, frames_per_update: int, arguments: argparse.Namespace, python: Path | None
+    task: str,
+    frames_per_update: int,
+    peers: dict[str, Contender],
+    arguments: argparse.Namespace,
+    versions: dict[str, str],
 ) -> None:
-    contenders = {
-        name: Contender(command, stderr=subprocess.DEVNULL)
-        for name, command in commands(task, frames_per_update, arguments.methods, python).items()
-    }
-    for contender in contenders.values():
+    ours = start_ours(task, frames_per_update, arguments.methods)
+    for contender in ours.values():
         contender.await_ready()
-    cases = {
-        name: partial(one.frames_per_second, arguments.seconds) for name, one in contenders.items()
-    }
+    seconds = arguments.seconds
+    cases = {name: partial(each.frames_per_second, seconds) for name, each in ours.items()}
+    for name, (peer, at_once) in peer_cases(frames_per_update).items() if peers else ():
+        order = seconds, frames_per_update, at_once
+        cases[name] = partial(peers[peer].frames_per_second, *order)
     values = interleave(cases, arguments.repeats)
     for name in cases:
-        ours = name in OURS
-        others = [other for other in cases if other not in OURS or other == "sac"] if ours else []
+        others = [other for other in cases if other == "sac" or other not in ours]
         line(
             "end_to_end",
             f"{task}/1:{frames_per_update}/{name}",
             "frames/s",
             values[name],
-            peers={other: values[other] for other in others},
-            seconds=arguments.seconds,
+            peers={other: values[other] for other in others if name in ours},
+            seconds=seconds,
+            **({"peer_versions": versions} if versions else {}),
         )
-    for contender in contenders.values():
+    for contender in ours.values():
         contender.close()
 
 
@@ -115,8 +129,13 @@ def main() -> None:
     arguments = parser.parse_args()
     python = peer_python(arguments.peer)
     for task in arguments.envs:
+        peers, versions = start_peers(task, python), {}
+        for peer in peers.values():
+            versions |= json.loads(peer.await_ready())
         for frames_per_update in arguments.frames_per_update:
-            compare(task, frames_per_update, arguments, python)
+            compare(task, frames_per_update, peers, arguments, versions)
+        for peer in peers.values():
+            peer.close()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """SAC of Stable-Baselines3, or of SBX, training as told: the peers of end_to_end.py.
 
-Runs in their environment. Reads a number of seconds a line, trains for so long, and answers with
-the frames a second.
+Runs in their environment. Its versions come first; then it reads lines of three numbers: seconds,
+frames per update and updates made at a time. It trains for so long and answers with the frames a
+second.
 """
 
 from __future__ import annotations
@@ -11,8 +12,11 @@ import sys
 import time
 from importlib import import_module
 
+from peer_update import PACKAGES, versions
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 LEARNING_STARTS = 500
@@ -32,39 +36,50 @@ class Until(BaseCallback):
         return not self.over
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--library", required=True, choices=("stable_baselines3", "sbx"))
-    parser.add_argument("--env", required=True)
-    parser.add_argument("--frames-per-update", type=int, required=True)
-    parser.add_argument("--envs", type=int, default=1, help="in processes, if several")
-    parser.add_argument("--updates-at-once", type=int, default=1)
-    arguments = parser.parse_args()
-    rollout = arguments.frames_per_update * arguments.updates_at_once
-    agent = import_module(arguments.library).SAC(
+def make_agent(library: str, env: str, envs: int) -> OffPolicyAlgorithm:
+    """SAC with ReLU nets without layer norm, about to learn."""
+    agent = import_module(library).SAC(
         "MlpPolicy",
         make_vec_env(
-            f"myosuite:{arguments.env}",  # the module that registers it
-            arguments.envs,
+            f"myosuite:{env}",  # the module that registers it
+            envs,
             seed=0,
-            vec_env_cls=SubprocVecEnv if arguments.envs > 1 else DummyVecEnv,
+            vec_env_cls=SubprocVecEnv if envs > 1 else DummyVecEnv,
         ),
         policy_kwargs={"net_arch": [256, 256]},
         batch_size=256,
         buffer_size=100_000,
         learning_starts=LEARNING_STARTS,
-        train_freq=rollout // arguments.envs,
-        gradient_steps=arguments.updates_at_once,
         device="cpu",
         seed=0,
     )
-    agent.learn(LEARNING_STARTS + 2 * rollout + 1)
+    agent.learn(LEARNING_STARTS)
+    return agent
+
+
+def frames_per_second(
+    agent: OffPolicyAlgorithm, seconds: float, frames_per_update: int, updates_at_once: int
+) -> float:
+    steps = frames_per_update * updates_at_once // agent.n_envs
+    agent.train_freq = TrainFreq(steps, TrainFrequencyUnit.STEP)
+    agent.gradient_steps = updates_at_once
+    begun, before = time.perf_counter(), agent.num_timesteps
+    agent.learn(10**9, callback=Until(begun + seconds), reset_num_timesteps=False)
+    return (agent.num_timesteps - before) / (time.perf_counter() - begun)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--library", required=True, choices=PACKAGES)
+    parser.add_argument("--env", required=True)
+    parser.add_argument("--envs", type=int, default=1, help="in processes, if several")
+    arguments = parser.parse_args()
+    print(versions(arguments.library), flush=True)
+    agent = make_agent(arguments.library, arguments.env, arguments.envs)
     print("ready", flush=True)
     for line in sys.stdin:
-        begun, before = time.perf_counter(), agent.num_timesteps
-        agent.learn(10**9, callback=Until(begun + float(line)), reset_num_timesteps=False)
-        frames = agent.num_timesteps - before
-        print(frames / (time.perf_counter() - begun), flush=True)
+        seconds, *counts = line.split()
+        print(frames_per_second(agent, float(seconds), *map(int, counts)), flush=True)
     agent.get_env().close()
 
 

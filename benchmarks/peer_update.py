@@ -21,10 +21,15 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-VERSIONS = {
+PACKAGES = {
     "stable_baselines3": ("stable_baselines3", "torch"),
     "sbx": ("sbx-rl", "jax", "jaxlib", "flax", "optax"),
 }
+
+
+def versions(library: str) -> str:
+    """Of what the library runs on, as a line of JSON."""
+    return json.dumps({name: version(name) for name in PACKAGES[library]})
 
 
 class Sizes(gymnasium.Env):
@@ -74,7 +79,7 @@ def main() -> None:
     case = json.loads(sys.argv[1])
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     agent, at_once = make_agent(case), case["updates_at_once"]
-    print(json.dumps({name: version(name) for name in VERSIONS[case["library"]]}), flush=True)
+    print(versions(case["library"]), flush=True)
     for line in sys.stdin:
         calls = max(1, int(line) // at_once)
         start = time.process_time()
