@@ -8,9 +8,11 @@ from functools import cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.command_line import translate
+from torchrl_etl.training.resumed import parse_override
 
 ROOT = Path(__file__).parent.parent
 CONF = ROOT / "recipes" / "conf"
@@ -27,7 +29,9 @@ TINY = (
     "exploration.encoder.hidden=[32,32]",
     "synergies.hidden=[32,32]",
     "explore.batch_size=32",
+    "explore.replay_ratio=0.0625",  # two updates a batch
     "learn.batch_size=32",
+    "learn.replay_ratio=0.0625",
     "explore.fit.final_updates=20",
     "progress=false",
     "pictures=false",
@@ -48,18 +52,25 @@ RESIDUAL = (
 def tiny(*overrides: str, name: str = "config", conf: Path = CONF) -> DictConfig:
     """The tiny configuration with overrides, of those settings that the chosen kinds have."""
     small = [setting for setting in TINY if _is_there(setting, overrides, conf)]
-    given = [override for override in overrides if not override.startswith("run_dir=")]
-    config = deepcopy(_composed(conf, name, *translate([*small, *given], conf)))
-    for override in overrides:
-        if override.startswith("run_dir="):
-            config.run_dir = override.removeprefix("run_dir=").strip("'")
+    given = [parse_override(override) for override in translate(overrides, conf)]
+    kinds = [override for override in given if not _is_value(override, conf)]
+    config = deepcopy(_composed(conf, name, *small, *(kind.input_line for kind in kinds)))
+    for override in given:
+        if override not in kinds:
+            OmegaConf.update(config, override.key_or_group, override.value())
     return config
+
+
+def _is_value(override: Override, conf: Path) -> bool:
+    """Whether an override gives a setting that is there another value, and chooses no file."""
+    plain = override.type is OverrideType.CHANGE
+    return plain and not (conf / override.key_or_group).is_dir()
 
 
 @cache  # composing takes a quarter of a second
 def _composed(conf: Path, name: str, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(conf), version_base="1.3"):
-        return compose(name, overrides=[*overrides])
+        return compose(name, overrides=[*translate(overrides, conf)])
 
 
 def _is_there(setting: str, overrides: Sequence[str], conf: Path) -> bool:
