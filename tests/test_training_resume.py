@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,12 +22,13 @@ from tests.runs import killed_when_saved, numbers
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
-from torchrl_etl.methods import etl
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
+
+pytestmark = pytest.mark.xdist_group("resume")  # many compare with the same run
 
 # With all that remembers what was seen, or goes by the frames.
 REMEMBERS = (
@@ -74,10 +76,21 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> Non
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory) -> dict[str, str]:
+def whole(tmp_path_factory) -> Path:
+    """A run that nothing interrupted."""
     run = tmp_path_factory.mktemp("whole") / "run"
     Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
-    return numbers(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(whole) -> dict[str, str]:
+    return numbers(whole)
+
+
+@pytest.fixture
+def copy(whole, tmp_path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "run"))
 
 
 @pytest.mark.slow
@@ -115,10 +128,8 @@ def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted)
     assert other["csv/scalars/learn/return.csv"] != uninterrupted["csv/scalars/learn/return.csv"]
 
 
-def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrupted):
-    run = tmp_path / "run"
-    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
-    newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
+def test_a_damaged_newest_checkpoint_falls_back_and_says_so(copy, uninterrupted):
+    newest = max((copy / "checkpoints" / "learn").glob("checkpoint-*"))
     victim = next(path for path in newest.rglob("*.memmap") if path.stat().st_size)
     content = bytearray(victim.read_bytes())
     content[0] ^= 1
@@ -126,9 +137,9 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(tmp_path, uninterrup
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        Experiment(resumed_config(run), resume=run).run()
+        Experiment(resumed_config(copy), resume=copy).run()
     assert any(f"{newest} is damaged" in str(warning.message) for warning in caught)
-    assert numbers(run) == uninterrupted
+    assert numbers(copy) == uninterrupted
 
 
 def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numbers(tmp_path):
@@ -145,25 +156,33 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
     assert numbers(broken) == numbers(whole)
 
 
-@pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatch):
-    run = tmp_path / "run"
+def stopped(number: int, run: Path) -> Experiment:
+    """A run that gets a signal in its seventh batch."""
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
-    explorer = Explorer(experiment.context)
-    stage = explorer.stage
-    monkeypatch.setattr(etl, "Explorer", lambda context: explorer)
-    collect = stage.collect
+    collect = Stage.collect
 
-    def collect_and_signal():
-        batch = collect()
-        if stage.progress.frames == 224:
+    def collect_and_signal(stage):
+        batch = collect(stage)
+        if stage.frames == 224:
             os.kill(os.getpid(), number)
         return batch
 
-    monkeypatch.setattr(stage, "collect", collect_and_signal)
-    with pytest.raises(Interrupted):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(Stage, "collect", collect_and_signal)
         experiment.run()
-    assert (run / "checkpoints/explore/checkpoint-000000000224/seal.json").exists()
+    return experiment
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_polite_stop_saves_and_leaves(number, tmp_path):
+    stopped(number, tmp_path / "run")
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").glob("*/*")
+    assert checkpoint.name == "checkpoint-000000000224" and (checkpoint / "seal.json").exists()
+
+
+def test_a_run_that_was_stopped_politely_goes_on(tmp_path):
+    run = tmp_path / "run"
+    experiment = stopped(signal.SIGINT, run)
     summary = Experiment(resumed_config(run), resume=run).run()
     assert summary["learn"]["frames"] == 608
     frames, _ = experiment.folder.series("explore/updates")
@@ -174,7 +193,7 @@ def test_a_polite_stop_saves_and_leaves_and_goes_on(number, tmp_path, monkeypatc
 @pytest.mark.parametrize("kind", ["process", "async"])
 def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, tmp_path):
     run = tmp_path / "run"
-    arguments = [*TINY, f"collector={kind}", "collector.num_workers=2", "explore.frames=1000000"]
+    arguments = [*TINY, f"collector={kind}", "collector.num_workers=1", "explore.frames=1000000"]
     process = subprocess.Popen(
         [sys.executable, ROOT / "recipes" / "etl_sac.py", *arguments, f"run_dir='{run}'"],
         stdout=subprocess.PIPE,
@@ -194,23 +213,18 @@ def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, t
     assert "Traceback" not in output
 
 
-def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(tmp_path):
-    run = tmp_path / "run"
-    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
-    for seal in (run / "checkpoints" / "learn").glob("*/seal.json"):
+def test_when_every_checkpoint_is_damaged_nothing_is_begun_anew_over_them(copy):
+    for seal in (copy / "checkpoints" / "learn").glob("*/seal.json"):
         seal.write_text("{}")
     with (
         pytest.warns(UserWarning, match="is damaged"),
         pytest.raises(OSError, match="or start a new run"),
     ):
-        Experiment(resumed_config(run), resume=run).run()
+        Experiment(resumed_config(copy), resume=copy).run()
 
 
-def test_a_checkpoint_that_could_run_code_is_not_loaded(tmp_path):
-    run = tmp_path / "run"
-    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
-    experiment.run()
-    newest = max((run / "checkpoints" / "learn").glob("checkpoint-*"))
+def test_a_checkpoint_that_could_run_code_is_not_loaded(copy):
+    newest = max((copy / "checkpoints" / "learn").glob("checkpoint-*"))
     assert {path.suffix for path in newest.rglob("*") if path.is_file()} == {".json", ".memmap"}
     (newest / "planted.pkl").write_bytes(b"not even read")
     digests = _digests(newest)
@@ -253,24 +267,25 @@ def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_pa
     update, updates = SACLearner.update, []
 
     def update_and_signal(self, batch):
-        updates.append(update(self, batch))
-        if len(updates) == 20:
-            os.kill(os.getpid(), signal.SIGINT)
-        return updates[-1]
+        if experiment.folder.explored.exists():  # in stage 2
+            updates.append(batch)
+            if len(updates) == 20:
+                os.kill(os.getpid(), signal.SIGINT)
+        return update(self, batch)
 
     monkeypatch.setattr(SACLearner, "update", update_and_signal)
     with pytest.raises(Interrupted):
         experiment.run()
-    assert len(updates) < 40
+    assert len(updates) < 600 // 16
     monkeypatch.undo()
     Experiment(resumed_config(run), resume=run).run()
-    own = (608 - 96) * 0.25  # none for the batches up to 100 frames
-    assert experiment.folder.series("learn/updates")[1][-1] == own + 600 * 0.25
+    own = 608 - 96  # none for the batches up to 100 frames
+    assert experiment.folder.series("learn/updates")[1][-1] == (own + 600) // 16
 
 
-def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path):
+def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(f"run_dir='{run}'", "stage=explore"))
+    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "stage=explore"))
     experiment.run()
     file = experiment.folder.explored
     file.rename(f"{file}.away")
@@ -278,21 +293,23 @@ def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path):
         Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
     Path(f"{file}.away").rename(file)
     Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
-    whole = tmp_path / "whole"
-    Experiment(tiny(f"run_dir='{whole}'")).run()
-    assert numbers(run) == numbers(whole)
+    assert numbers(run) == uninterrupted
 
 
-def test_a_longer_budget_can_be_given_when_resuming(tmp_path):
-    run = tmp_path / "run"
-    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "learn.frames=320")).run()
-    longer = resumed_config(run, ["learn.frames=640", f"resume={run}"])
-    summary = Experiment(longer, resume=run).run()
+def test_a_longer_budget_can_be_given_when_resuming(copy):
+    longer = resumed_config(copy, ["learn.frames=640", f"resume={copy}"])
+    summary = Experiment(longer, resume=copy).run()
     assert summary["learn"]["frames"] == 640
 
 
-@pytest.mark.parametrize("compile", ["false", pytest.param("true", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["explore", "learn"])
+@pytest.mark.parametrize(
+    ("name", "compile"),
+    [
+        ("explore", "false"),
+        pytest.param("explore", "true", marks=pytest.mark.slow),
+        ("learn", "false"),
+    ],
+)
 def test_learner_state_is_bit_exact_after_a_load(name, compile, tmp_path):
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", f"compile={compile}"))
 
