@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from tests.configs import CONF, tiny
-from tests.test_training_resume import numbers
+from tests.runs import numbers
+from tests.stages import fill, method_stage
 from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.envs import EnvironmentSpec, make_env
@@ -156,15 +157,22 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "method", ["dynsyn", "eme", "lattice", "lattice_plain"]
-)  # losses or actors of their own
-def test_a_rival_compiles(method, tmp_path):
-    stage = Experiment(config(method, tmp_path / "run", "compile=true")).method.stage()
-    stage.restart_collection()
-    stage.collect()
-    assert all(value.isfinite().all() for value in stage.update().values())
+@pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice", "lattice_plain"])
+def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method):
+    stage = method_stage(method)
+    fill(stage)
+    batch, gradients = stage.sample(), stage.learner.gradients
     stage.close()
+    with torch._dynamo.config.patch(trace_autograd_ops=True):
+        traced = torch.compile(gradients, fullgraph=True, backend="aot_eager")
+        outs = []
+        for call in (gradients, traced):
+            torch.manual_seed(0)
+            outs.append(call(batch.clone()))
+    (expected, logged), (found, logged_too) = outs
+    torch.testing.assert_close(found, expected)
+    for key, value in logged.items():
+        torch.testing.assert_close(logged_too[key], value)
 
 
 def test_eme_measures_with_the_discount_of_its_learner(tmp_path):
