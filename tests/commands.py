@@ -1,4 +1,4 @@
-"""A recipe in this process: what a person types, without the seconds that imports take."""
+"""A script in this process: what a person types, without the seconds that imports take."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.util
 import logging
 import runpy
 import sys
+from pathlib import Path
 from types import ModuleType
 
 from pytest import MonkeyPatch
@@ -14,16 +15,22 @@ from tests.configs import ROOT
 
 
 def command(recipe: str, *arguments: str) -> int:
-    """Run a recipe with arguments as its command line; returns its exit code.
+    """Run ``recipes/RECIPE`` with arguments as its command line; returns its exit code."""
+    return script(ROOT / "recipes" / recipe, *arguments)
+
+
+def script(path: Path, *arguments: str) -> int:
+    """Run a script with arguments as its command line; returns its exit code.
 
     ``sys.exit`` with a text prints it, as the interpreter does.
     """
     with MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [recipe, *arguments])
+        patch.setattr(sys, "argv", [str(path), *arguments])
+        patch.setattr(sys, "path", [str(path.parent), *sys.path])
         # Hydra sets logging up anew, on which absl closes the stream it wrote to: pytest's.
         patch.setattr(logging, "shutdown", lambda *handlers: None)
         try:
-            runpy.run_path(str(ROOT / "recipes" / recipe), run_name="__main__")
+            runpy.run_path(str(path), run_name="__main__")
         except SystemExit as left:
             if isinstance(left.code, str):
                 sys.stderr.write(f"{left.code}\n")

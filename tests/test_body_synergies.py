@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,6 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from studies.body_synergies import body_decoder, muscle_changes
+from tests.commands import script
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis import joint_effects
 from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env
@@ -60,14 +58,12 @@ def test_the_decoder_rests_where_it_is_told_and_moves_joints():
         body_decoder(env, changes, rest=0.95)
 
 
-def script(name, *arguments):
-    command = [sys.executable, str(ROOT / "studies" / name), *map(str, arguments)]
-    environ = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, check=True, timeout=240, capture_output=True, env=environ)
+def study(name, *arguments):
+    assert script(ROOT / "studies" / name, *map(str, arguments)) == 0
 
 
 def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_path):
-    script("body_synergies.py", TASK, tmp_path / "body", "--num-synergies", 5)
+    study("body_synergies.py", TASK, tmp_path / "body", "--num-synergies", 5)
     decoder, info = load_bundle(tmp_path / "body")
     assert decoder.num_synergies == 5
     assert info.facts["joint_share"] > 0.8
@@ -79,8 +75,8 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
     save_bundle(random, run / "synergies", task=TASK, actuators=info.actuators, facts=facts)
     config = tiny(f"env={TASK}", "seed=3", "exploration.bonus.extrinsic_weight=1")
     OmegaConf.save(config, run / "config.yaml")
-    script("joint_effects.py", run, "--out", tmp_path / "rows.csv")
-    script("joint_effects.py", run, "--out", tmp_path / "rows.csv")
+    study("joint_effects.py", run, "--out", tmp_path / "rows.csv")
+    study("joint_effects.py", run, "--out", tmp_path / "rows.csv")
     with (tmp_path / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     kinds = ["uniform_actions", "random_directions", "body", "explored", "explored"]

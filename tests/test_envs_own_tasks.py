@@ -12,9 +12,11 @@ import gymnasium as gym
 import pytest
 import torch
 
-from tests.configs import ROOT
+from tests.commands import command
+from tests.configs import ROOT, TINY
 from torchrl_etl.envs import actuator_names, make_env, resolve_task
 
+SMALL = [*(setting for setting in TINY if not setting.startswith("env=")), "method=sac"]
 REACH = """
 import gymnasium as gym
 import numpy as np
@@ -51,7 +53,7 @@ def own(tmp_path, monkeypatch) -> str:
     sys.modules.pop(module, None)
 
 
-def recipe(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
+def process(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, str(ROOT / "recipes" / name), *overrides],
         capture_output=True,
@@ -91,29 +93,22 @@ def test_what_the_module_itself_lacks_is_told_as_it_is(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("collector", ["single", "process"])
-def test_a_recipe_runs_and_evaluates_a_task_of_one_s_own(collector, own, tmp_path):
-    done = recipe(
-        "etl_sac.py",
-        f"env={own}",
-        "experiment=smoke",
-        "method=sac",
-        f"collector={collector}",
-        "success_key=arrived",
-        "progress=false",
-        "pictures=false",
-        "threads=1",
-        f"run_dir='{tmp_path}/run'",
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
+def test_a_recipe_trains_and_evaluates_a_task_of_one_s_own(own, tmp_path):
+    run = f"run_dir='{tmp_path}/run'"
+    assert command("etl_sac.py", *SMALL, f"env={own}", "success_key=arrived", run) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["env"] == own and summary["goal"] is None
     assert 0 <= summary["learn"]["solved"]["after"] <= 1
-    done = recipe("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=tmp_path)
+    assert command("evaluate.py", f"run='{tmp_path}/run'", "episodes=1") == 0
+
+
+@pytest.mark.slow
+def test_workers_find_a_task_of_one_s_own_and_a_recipe_elsewhere_does_not(own, tmp_path):
+    settings = ("collector=process", "success_key=arrived", f"run_dir='{tmp_path}/run'")
+    done = process("etl_sac.py", *SMALL, f"env={own}", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (elsewhere := tmp_path / "elsewhere").mkdir()
-    done = recipe("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=elsewhere)
+    done = process("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=elsewhere)
     assert done.returncode != 0 and "Traceback" not in done.stderr
     assert "There is no module" in done.stderr
 

@@ -14,7 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
-from tests.commands import recipe_module
+from tests.commands import command, recipe_module
 from tests.configs import CONF, ROOT, TINY
 from torchrl_etl.analysis.sweep_results import COLUMNS
 from torchrl_etl.training import Run, Sweep
@@ -23,10 +23,7 @@ SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=
 SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]
 
 
-def command(out: Path, *overrides: str) -> list[str]:
-    recipe = [sys.executable, str(ROOT / "recipes" / "sweep.py")]
-    common = ["tasks=[overactuated]", "frames=900", f"settings={' '.join(SMALL)}", f"out={out}"]
-    return [*recipe, *common, *overrides]
+RECIPE = [sys.executable, str(ROOT / "recipes" / "sweep.py")]
 
 
 def results(out: Path) -> list[dict[str, str]]:
@@ -47,8 +44,11 @@ def small_run(tmp_path: Path, text: str) -> Run:
 @pytest.mark.slow
 def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
     out = tmp_path / "a sweep"
-    arguments = command(out, "methods=[sac,etl]", "seeds=[0]", "jobs=2")
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    what = ["tasks=[overactuated]", "methods=[sac,etl]", "seeds=[0]", "frames=900", "jobs=2"]
+    arguments = [*what, f"settings={' '.join(SMALL)}", f"out={out}"]
+    process = subprocess.Popen(
+        [*RECIPE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
     first = out / "overactuated-sac-seed0" / "checkpoints" / "learn"
     deadline = time.monotonic() + 120
     while not list(first.glob("*/seal.json")):
@@ -58,7 +58,7 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
 
-    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=300)
+    ended = subprocess.run([*RECIPE, *arguments], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     rows = results(out)
     assert {row["method"] for row in rows} == {"sac", "etl"}
@@ -70,8 +70,7 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
     assert all(float(row["wall_seconds"]) >= 0 and row["commit"] for row in rows)
 
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
-    again = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
-    assert again.returncode == 0 and len(before) == 2
+    assert command("sweep.py", *arguments) == 0 and len(before) == 2
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
 
 
