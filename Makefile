@@ -21,7 +21,7 @@ demo: $(VENV)/.complete
 # Where the site's tools cannot be had, the tests of the site are skipped, with that reason.
 test: $(VENV)/.complete lint
 	-$(MAKE) --no-print-directory .venv-docs/.complete
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --durations=25
+	$(BIN)/python -m pytest -n 2 --dist loadfile --durations=25
 
 smoke: $(VENV)/.complete
 	set -e; for task in $$($(BIN)/python recipes/list_tasks.py names); do \
