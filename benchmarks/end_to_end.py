@@ -124,7 +124,7 @@ def main() -> None:
         "--frames-per-update", nargs="+", type=int, default=(1, 8), choices=COLLECTORS
     )
     parser.add_argument("--peer", default=PYTHON, help="Python of the peers, or none")
-    parser.add_argument("--seconds", type=float, default=6.0, help="of one measurement")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of one measurement")
     parser.add_argument("--repeats", type=int, default=2)
     arguments = parser.parse_args()
     python = peer_python(arguments.peer)

@@ -14,7 +14,7 @@ from tests.configs import ROOT
 from tests.stages import fill, method_stage
 
 FOLDER = ROOT / "benchmarks"
-NAMES = ("bench", "floor", "harness", "machine", "peers")
+NAMES = ("bench", "end_to_end", "floor", "harness", "machine", "peers")
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +32,24 @@ def test_the_tables_of_the_page_are_made_of_the_committed_lines(benchmarks):
     bench = benchmarks.bench
     page = bench.PAGE.read_text(encoding="utf-8")
     assert bench.BEGIN + bench.table(bench.written()) + bench.END in page
+
+
+def test_lines_beside_peers_tell_processor_threads_load_and_versions(benchmarks):
+    rows = [
+        row for row in benchmarks.bench.written() if row["benchmark"] in ("update", "end_to_end")
+    ]
+    assert {row["benchmark"] for row in rows} == set(benchmarks.bench.WITH_PEERS)
+    for row in rows:
+        assert {"cpu_flags", "threads", "load_at_start", "torch"} <= row.keys()
+        assert {"jax", "sbx-rl", "stable_baselines3"} <= row["peer_versions"].keys()
+
+
+def test_peers_make_as_many_updates_a_frame_as_ours(benchmarks):
+    end_to_end = benchmarks.end_to_end
+    for frames_per_update in end_to_end.COLLECTORS:
+        for peer, at_once in end_to_end.peer_cases(frames_per_update).values():
+            _, envs = end_to_end.PEERS[peer]
+            assert frames_per_update * at_once % envs == 0  # whole steps of all environments
 
 
 def test_a_line_has_the_ratios_to_others_within_each_round(benchmarks, capsys):
