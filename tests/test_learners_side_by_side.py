@@ -25,6 +25,13 @@ MAKERS = {
 }
 
 
+class Descent(torch.optim.SGD):
+    def step_along(self, gradients):
+        for parameter, gradient in zip(self.param_groups[0]["params"], gradients, strict=True):
+            parameter.grad = gradient
+        self.step()
+
+
 def draws(group, batches):
     """The random numbers of each learner, of a generator that was seeded with its seed."""
     drawn = []
@@ -65,7 +72,7 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
         other.learner.objective.load_state_dict(one.learner.objective.state_dict())
         other.learner.ema.load_state_dict(one.learner.ema.state_dict())
     for stage in (*ours, *theirs):  # Adam's first steps make a sign of rounding
-        stage.learner.optimizer = torch.optim.SGD(stage.learner.parameters, lr=1e-2)
+        stage.learner.optimizer = Descent(stage.learner.parameters, lr=1e-2)
     starts = [snapshot(stage.learner.ema) for stage in theirs]
     group = SideBySide([stage.learner for stage in ours])
     for _ in range(3):

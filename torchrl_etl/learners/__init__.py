@@ -1,6 +1,7 @@
 """What learns: networks, losses, targets and optimizer behind one ``update``."""
 
 from torchrl_etl.learners.build import build_learner
+from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.sac import SACLearner, entropy_target, from_observation
 from torchrl_etl.learners.side_by_side import SideBySide
@@ -12,6 +13,7 @@ __all__ = [
     "SACLearner",
     "SideBySide",
     "Term",
+    "WarmedUpEMA",
     "build_learner",
     "entropy_target",
     "from_observation",

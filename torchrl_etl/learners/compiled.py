@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import wraps
 from typing import Any
 
 import torch
 from tensordict.nn import CudaGraphModule
 
-__all__ = ["compiled", "cuda_graph"]
+__all__ = ["compiled", "cuda_graph", "without_guards"]
 
 _ELSE = "compile=false leaves out the attempt"
 
@@ -61,6 +62,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args)
 
     return call
+
+
+def without_guards() -> AbstractContextManager[None]:
+    """Compiled functions do not check here that what they were traced with is still so.
+
+    For calls after one that did, with nothing changed but what tensors hold.
+    """
+    return torch.compiler.set_stance(skip_guard_eval_unsafe=True)
 
 
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,30 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import torch
+from torch import nn
+from torch.optim.swa_utils import AveragedModel
 
-from torch import Tensor
-from torch.optim.swa_utils import get_ema_multi_avg_fn
-
-__all__ = ["warmed_up_ema"]
+__all__ = ["WarmedUpEMA"]
 
 
-def warmed_up_ema(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor], None]:
-    """``multi_avg_fn`` of :class:`~torch.optim.swa_utils.AveragedModel`: an EMA with a warm-up.
+class WarmedUpEMA(AveragedModel):
+    """A copy of a model whose weights are an EMA of the model's, with a warm-up.
 
     After ``n`` updates the decay is :math:`\\min(decay, (1 + n) / (10 + n))`, as in TensorFlow's
-    ``ExponentialMovingAverage``, so that a short run does not show its untrained weights.
+    ``ExponentialMovingAverage``, so that a short run does not show its untrained weights. Buffers
+    are copied.
+
+    Args:
+        model (nn.Module): must keep its tensors, which are looked up once.
+        decay (float): in [0, 1); 0 copies the weights.
 
     Examples:
         >>> import torch
-        >>> average = [torch.tensor([0.0])]
-        >>> warmed_up_ema(0.9)(average, [torch.tensor([11.0])], torch.tensor(1))
-        >>> average  # the decay is 2 / 11 by now
-        [tensor([9.])]
+        >>> from torchrl_etl.learners import WarmedUpEMA
+        >>> model = torch.nn.Linear(1, 1, bias=False)
+        >>> ema = WarmedUpEMA(model, decay=0.9)
+        >>> for weight in (0.0, 11.0):
+        ...     _ = torch.nn.init.constant_(model.weight, weight)
+        ...     ema.follow()
+        >>> ema.module.weight.item()  # the decay was 2 / 11
+        9.0
     """
 
-    def update(average: Sequence[Tensor], weights: Sequence[Tensor], updates: Tensor) -> None:
-        n = int(updates)
-        get_ema_multi_avg_fn(min(decay, (1 + n) / (10 + n)))(average, weights, updates)
+    def __init__(self, model: nn.Module, decay: float) -> None:
+        super().__init__(model)
+        self.decay = decay
+        self._parameters_of = list(self.module.parameters()), list(model.parameters())
+        self._buffers_of = list(self.module.buffers()), list(model.buffers())
 
-    return update
+    @torch.no_grad()
+    def follow(self) -> None:
+        """Take the weights of now into the average."""
+        n = int(self.n_averaged)
+        decay = min(self.decay, (1 + n) / (10 + n)) if n else 0.0
+        torch._foreach_lerp_(*self._parameters_of, 1 - decay)
+        if self._buffers_of[0]:
+            torch._foreach_copy_(*self._buffers_of)
+        self.n_averaged += 1

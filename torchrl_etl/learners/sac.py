@@ -16,13 +16,12 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.optim import Adam
-from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_positive, check_real
-from torchrl_etl.learners.compiled import compiled, cuda_graph
-from torchrl_etl.learners.ema import warmed_up_ema
+from torchrl_etl.learners.adam import GradientAdam
+from torchrl_etl.learners.compiled import compiled, cuda_graph, without_guards
+from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap, normalize_rows
@@ -145,7 +144,7 @@ class SACLearner:
         _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
         self.targets = [FusedSoftUpdate(sac, tau=tau)]
         self.targets += [term.target for term in terms if term.target is not None]
-        self.ema = AveragedModel(actor, multi_avg_fn=warmed_up_ema(ema_decay))
+        self.ema = WarmedUpEMA(actor, ema_decay)
         acting = actor if behavior is None else behavior
         self.behavior = from_observation(acting, normalizer, decoder)
         self.policy = from_observation(self.ema.module, normalizer, decoder)
@@ -163,8 +162,19 @@ class SACLearner:
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Learn from a batch of transitions [B]; returns scalars to log."""
         scalars = self._step(batch)
-        self.ema.update_parameters(self.actor)  # counts in Python: no part of a CUDA graph
+        self.ema.follow()  # counts in Python: no part of a CUDA graph
         return scalars
+
+    def updates(self, batches: TensorDictBase) -> TensorDictBase:
+        """Learn from batches [k, B], one after the other; returns scalars to log [k].
+
+        Nothing but tensors changes between them, so a compiled update looks at its guards once.
+        """
+        first, *others = batches.unbind(0)
+        scalars = [self.update(first)]
+        with without_guards():
+            scalars += [self.update(batch) for batch in others]
+        return torch.stack(scalars)
 
     def step(self, batch: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
@@ -174,9 +184,7 @@ class SACLearner:
 
     def descend(self, gradients: Sequence[Tensor | None]) -> None:
         """A step of the optimizer along gradients in the order of ``parameters``."""
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            parameter.grad = gradient
-        self.optimizer.step()
+        self.optimizer.step_along(gradients)
         normalize_rows(self.unit_rows)
         for target in self.targets:
             target.step()
@@ -193,6 +201,7 @@ class SACLearner:
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         self.optimizer.step()
+        self.optimizer.zero_grad()
         return scalars.detach()
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -305,7 +314,7 @@ def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[d
     return groups
 
 
-def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> Adam:
+def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> GradientAdam:
     """Adam that takes all steps in one operation, which a CUDA graph can hold.
 
     It reads learning rates from tensors there, so that they can change.
@@ -313,4 +322,4 @@ def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> Ad
     graphed = device.type == "cuda"
     if graphed:
         groups = [{**group, "lr": torch.tensor(group["lr"], device=device)} for group in groups]
-    return Adam(list(groups), fused=True, capturable=graphed)
+    return GradientAdam(list(groups), fused=True, capturable=graphed)

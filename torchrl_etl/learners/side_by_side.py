@@ -13,7 +13,7 @@ from torch.func import functional_call
 from torchrl.checkpoint import GlobalRNGState
 
 from torchrl_etl.draws import Draw, given_draws, recorded_draws
-from torchrl_etl.learners.compiled import compiled, cuda_graph
+from torchrl_etl.learners.compiled import compiled, cuda_graph, without_guards
 from torchrl_etl.learners.sac import SACLearner
 
 __all__ = ["SideBySide"]
@@ -100,8 +100,22 @@ class SideBySide:
         """
         scalars = self._step(stacked(batches, draws))
         for learner in self.learners:
-            learner.ema.update_parameters(learner.actor)
+            learner.ema.follow()
         return list(scalars.unbind(0))
+
+    def updates(
+        self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Sequence[Tensor]]]
+    ) -> list[TensorDictBase]:
+        """Updates of every learner on its batches [k, B], as many for each, one after the other.
+
+        Returns:
+            list of TensorDictBase: the scalars [k] of each.
+        """
+        turns = zip(zip(*batches, strict=True), zip(*draws, strict=True), strict=True)
+        scalars = [self.update(*next(turns))]
+        with without_guards():
+            scalars += [self.update(*turn) for turn in turns]
+        return [torch.stack(list(own)) for own in zip(*scalars, strict=True)]
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Everything of an update that runs on the device; returns scalars [seeds]."""

@@ -37,6 +37,10 @@ TRANSITION = (
 )
 
 
+AT_ONCE = 16
+"""Batches that are read from the buffer in one go, where it does nothing more than read them."""
+
+
 class Progress:
     """Counters of a stage, saved with it.
 
@@ -144,6 +148,8 @@ class Stage:
         self.transforms = nn.ModuleList(transforms)
         for transform in transforms:
             self.buffer.append_transform(transform)
+        # What a transform makes of a batch may depend on the updates before it: a bonus does.
+        self._at_once = 1 if transforms else AT_ONCE
         self._kept = [*TRANSITION, *keep]
         self.multi_step = None
         if n_steps > 1:
@@ -184,18 +190,23 @@ class Stage:
         self.progress.owed -= due
         self.progress.updates += due
         logs = []
-        for _ in range(due):
-            batch = self.sample()
+        for count in parts(due, self._at_once):
+            batches = self.samples(count)
             if self._update is None:
-                logs.append((yield Due(self.name, self.learner, batch)))
+                logs.append((yield Due(self.name, self.learner, batches)))
             else:
-                logs.append(self._update(batch))
+                logs.append(torch.stack([self._update(batch) for batch in batches]))
         self.learner.advance(self.frames, self.frames / self.budget)
-        return torch.stack(logs).mean(0) if logs else None
+        return torch.cat(logs).mean(0) if logs else None
+
+    def samples(self, count: int) -> TensorDictBase:
+        """Batches [count, B] out of the buffer."""
+        size = self.buffer.batch_size
+        return self.buffer.sample(count * size).to(self.device).reshape(count, size)
 
     def sample(self) -> TensorDictBase:
         """A batch [B] out of the buffer."""
-        return self.buffer.sample().to(self.device)
+        return self.samples(1)[0]
 
     def update(self) -> TensorDictBase:
         """One update on a sampled batch; returns scalars to log."""
@@ -283,6 +294,16 @@ class ReservedMemmapStorage(LazyMemmapStorage):
             raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
         for file in Path(self.scratch_dir).rglob("*.memmap"):
             reserve(file)
+
+
+def parts(total: int, most: int) -> list[int]:
+    """A number as a sum of numbers that are no larger than ``most``.
+
+    Examples:
+        >>> parts(40, 16)
+        [16, 16, 8]
+    """
+    return [min(most, total - done) for done in range(0, total, most)]
 
 
 def frames_per_action(collector: Mapping[str, Any], action_repeat: int) -> int:

@@ -37,8 +37,8 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
         for run in runs:
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
-            for stage in dict.fromkeys(run.due.stage for run in waiting):
-                _update([run for run in waiting if run.due.stage == stage], groups)
+            for alike in dict.fromkeys(run.alike for run in waiting):
+                _update([run for run in waiting if run.alike == alike], groups)
     finally:
         for run in runs:
             run.work.close()
@@ -52,6 +52,11 @@ class _Run(Generic[Result]):
         self.work, self.random = work, GlobalRNGState().state_dict()
         self.due: Due | None = None
         self.result: Result | BaseException
+
+    @property
+    def alike(self) -> tuple[str, int]:
+        """What is due to runs that can be updated together: the stage, and how many updates."""
+        return self.due.stage, len(self.due.batches)
 
     def __enter__(self) -> None:
         GlobalRNGState().load_state_dict(self.random)
@@ -74,7 +79,7 @@ def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
     if len(runs) == 1:
         (run,) = runs
         with run:
-            scalars = run.due.learner.update(run.due.batch)
+            scalars = run.due.learner.updates(run.due.batches)
         run.go_on(scalars)
         return
     learners = [run.due.learner for run in runs]
@@ -84,7 +89,7 @@ def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
     draws = []
     for run in runs:
         with run:
-            draws.append(group.draw(run.due.batch))
-    scalars = group.update([run.due.batch for run in runs], draws)
+            draws.append([group.draw(batch) for batch in run.due.batches])
+    scalars = group.updates([run.due.batches for run in runs], draws)
     for run, own in zip(runs, scalars, strict=True):
         run.go_on(own)

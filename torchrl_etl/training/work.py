@@ -1,4 +1,4 @@
-"""Work that pauses wherever an update is due, so that runs can take their updates together."""
+"""Work that pauses wherever updates are due, so that runs can take their updates together."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ Result = TypeVar("Result")
 
 
 class Due(NamedTuple):
-    """An update that a learner has earned, on this batch [B], in the stage of this name."""
+    """Updates that a learner has earned, on these batches [k, B], in the stage of this name."""
 
     stage: str
     learner: SACLearner
-    batch: TensorDictBase
+    batches: TensorDictBase
 
 
-# It yields what is due, is sent the scalars of that update, and returns what it is done for.
+# It yields what is due, is sent the scalars [k] of those updates, and returns what it is done for.
 Work: TypeAlias = Generator[Due, TensorDictBase, Result]
 
 
 def alone(work: Work[Result]) -> Result:
-    """Do the work, every update when it is due."""
+    """Do the work, all updates when they are due."""
     with closing(work):
         try:
             due = next(work)
             while True:
-                due = work.send(due.learner.update(due.batch))
+                due = work.send(due.learner.updates(due.batches))
         except StopIteration as end:
             return end.value

@@ -1,0 +1,78 @@
+"""Adam that is handed its gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim.adam import Adam, adam
+
+__all__ = ["GradientAdam"]
+
+
+class GradientAdam(Adam):
+    """:class:`torch.optim.Adam` whose step takes gradients, all parameters in one operation.
+
+    Adam walks its parameters in Python at every step. Between products that fill a processor's
+    caches this takes twice as long as the step itself; here they are walked once.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_etl.learners.adam import GradientAdam
+        >>> weight = torch.nn.Parameter(torch.tensor([1.0]))
+        >>> optimizer = GradientAdam([weight], lr=0.1, fused=True)
+        >>> for _ in range(2):  # the first steps are as long as the learning rate
+        ...     optimizer.step_along([torch.tensor([5.0])])
+        >>> weight
+        Parameter containing:
+        tensor([0.8000], requires_grad=True)
+    """
+
+    _walked: list[tuple[dict[str, Any], list[int], list[list[Tensor]]]] | None = None
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self._walked = None
+
+    @torch.no_grad()
+    def step_along(self, gradients: Sequence[Tensor | None]) -> None:
+        """One step along gradients in the order of the parameters; ``None`` leaves its parameter.
+
+        Which of them are ``None`` must not change.
+        """
+        if self._walked is None:
+            self._begin(gradients)
+            return
+        for group, at, (parameters, *moments, steps) in self._walked:
+            beta1, beta2 = group["betas"]
+            adam(
+                parameters,
+                [gradients[i] for i in at],
+                *moments,
+                [],
+                steps,
+                fused=True,
+                amsgrad=False,
+                beta1=beta1,
+                beta2=beta2,
+                **{name: group[name] for name in ("lr", "weight_decay", "eps", "maximize")},
+            )
+
+    def _begin(self, gradients: Sequence[Tensor | None]) -> None:
+        """A step of Adam's own, which makes its state, and a walk over that."""
+        parameters = [p for group in self.param_groups for p in group["params"]]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.step()
+        self.zero_grad()
+        self._walked, index = [], 0
+        for group in self.param_groups:
+            at = [i for i, _ in enumerate(group["params"], index) if gradients[i] is not None]
+            index += len(group["params"])
+            own = [parameters[i] for i in at]
+            states = [self.state[parameter] for parameter in own]
+            kept = [[state[key] for state in states] for key in ("exp_avg", "exp_avg_sq", "step")]
+            if own:
+                self._walked.append((group, at, [own, *kept]))
