@@ -24,7 +24,7 @@ def found():
 def test_the_policy_is_paid_with_the_bonus_and_reads_the_observation_alone(found):
     assert found.exploration.reward == "intrinsic_reward"
     assert found.stage.learner.objective.sac.tensor_keys.reward == "intrinsic_reward"
-    batch = found.stage.buffer.sample()
+    batch = found.stage.sample()
     assert "direction" not in batch.keys() and batch["next", "intrinsic_reward"].shape == (32, 1)
     assert found.exploration.embed(batch) is None
 
@@ -41,7 +41,7 @@ def test_one_update_moves_policy_predictor_and_gmvae_but_not_the_random_network(
 
 def test_only_the_terms_loss_reaches_the_predictor(found):
     loss, objective = found.exploration.loss, found.stage.learner.objective
-    batch = found.stage.buffer.sample()
+    batch = found.stage.sample()
     parameters = list(loss.predictor_network.parameters())
     own = torch.autograd.grad(loss(batch)["loss_predictor"], parameters)
     assert all(gradient.abs().sum() > 0 for gradient in own)

@@ -66,7 +66,7 @@ def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(conf):
     found.stage.restart_collection()
     for _ in range(6):
         found.stage.collect()
-    batch, loss = found.stage.buffer.sample(), found.exploration.loss
+    batch, loss = found.stage.sample(), found.exploration.loss
     inputs = torch.cat([batch["observation"], batch["action"]], -1)
     error = (loss.model(inputs) - batch["next", "observation"]).square().sum(-1, keepdim=True)
     torch.testing.assert_close(batch["next", "surprise"], error)

@@ -120,7 +120,7 @@ def test_embedding_size_follows_the_synergies_unless_given():
 
 def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
     stage = explored().stage
-    batch = stage.buffer.sample()
+    batch = stage.sample()
     objective = stage.learner.objective
 
     def metric_and_critic(key: str, factor: float) -> tuple[float, float]:

@@ -24,7 +24,7 @@ def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
         lambda _, args: seen.update(reward=args[0]["next", "reward"])
     )
     torch.manual_seed(0)
-    kept = stage.buffer.sample()["next", "reward"]
+    kept = stage.sample()["next", "reward"]
     torch.manual_seed(0)
     before = snapshot(stage.learner.behavior)
     stage.update()

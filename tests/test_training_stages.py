@@ -85,7 +85,7 @@ def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
 
     def bonus_and_expected():
         torch.manual_seed(0)
-        batch = stage.buffer.sample()
+        batch = stage.sample()
         with torch.no_grad():
             phi, phi_next = (
                 found.exploration.encoder.module(batch.get(key))
@@ -134,14 +134,14 @@ def test_an_update_learns_for_directions_that_nobody_followed():
     stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
-    drawn = {tuple(row) for row in stage.buffer.sample()["direction"].tolist()}
+    drawn = {tuple(row) for row in stage.sample()["direction"].tolist()}
     assert not followed & drawn
     stage.close()
     found = explorer("exploration.relabel=0")
     stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
-    assert {tuple(row) for row in stage.buffer.sample()["direction"].tolist()} <= followed
+    assert {tuple(row) for row in stage.sample()["direction"].tolist()} <= followed
     stage.close()
 
 
@@ -149,7 +149,7 @@ def test_the_better_share_is_the_better_rewarded_one():
     found = explorer("explore.fit.best_share=0.25", "explore.fit.actions=mean")
     stage = found.stage
     fill(stage)
-    batch = stage.buffer.sample()
+    batch = stage.sample()
     best = found.shown(batch)["action"]
     reward = batch["next", "reward"].squeeze(-1)
     threshold = reward.sort(descending=True).values[7]
@@ -294,7 +294,7 @@ def test_a_compiled_update_is_the_same_update():
     settings = (*RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])
-    batch = stages[0].buffer.sample()
+    batch = stages[0].sample()
     stages[1].learner.objective.load_state_dict(stages[0].learner.objective.state_dict())
     outs = []
     for stage in stages:

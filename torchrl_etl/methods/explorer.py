@@ -105,7 +105,7 @@ class Explorer:
             self.model.fit(self.actions(), on_update=on_update)
         for _ in range(self.final_updates if self.term is not None else 0):
             on_update()
-            self.stage.learner.update_term(self.term, self.stage.buffer.sample())
+            self.stage.learner.update_term(self.term, self.stage.sample())
         return self.model.decoder(self.actions())
 
     def actions(self, count: int = 20_000) -> torch.Tensor:

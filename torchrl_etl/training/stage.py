@@ -129,7 +129,8 @@ class Stage:
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
         self.restart_seed = restart_seed
         self._update = update
-        self.replay_ratio, self.learning_starts = replay_ratio, learning_starts
+        self.batch_size, self.replay_ratio = batch_size, replay_ratio
+        self.learning_starts = learning_starts
         self.progress = Progress()
         self.batches: Batches | None = None
         self._make_batches = partial(
@@ -142,8 +143,7 @@ class Stage:
         self.buffer = TensorDictReplayBuffer(
             storage=make_storage(
                 room, device, scratch / name if buffer_storage == "memmap" else None
-            ),
-            batch_size=batch_size,
+            )
         )
         self.transforms = nn.ModuleList(transforms)
         for transform in transforms:
@@ -201,8 +201,8 @@ class Stage:
 
     def samples(self, count: int) -> TensorDictBase:
         """Batches [count, B] out of the buffer."""
-        size = self.buffer.batch_size
-        return self.buffer.sample(count * size).to(self.device).reshape(count, size)
+        rows = self.buffer.sample(count * self.batch_size).to(self.device)
+        return rows.reshape(count, self.batch_size)
 
     def sample(self) -> TensorDictBase:
         """A batch [B] out of the buffer."""
