@@ -16,7 +16,7 @@ export OMP_NUM_THREADS ?= 1
 .PHONY: demo test docs bench smoke lint lock clean
 
 demo: $(VENV)/.complete
-	$(BIN)/python recipes/etl_sac.py env=myoHandPenTwirl experiment=demo
+	$(BIN)/python recipes/etl_sac.py env=myoHandReachFixed-v0 experiment=demo
 
 # Where the site's tools cannot be had, the tests of the site are skipped, with that reason.
 test: $(VENV)/.complete lint
