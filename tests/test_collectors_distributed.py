@@ -23,7 +23,7 @@ from tests.synergy_policy import (
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.collectors.distributed import DistributedWorkers
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("distributed")]
+pytestmark = [pytest.mark.slow]
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.collectors.ray import RayWorkers
 
 ray = pytest.importorskip("ray")
-pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.xdist_group("ray")]
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,6 @@ def hand(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.xdist_group("hand")
 @pytest.mark.slow
 def test_a_run_leaves_everything_behind(hand):
     for name in (
@@ -83,7 +82,6 @@ def test_a_run_leaves_everything_behind(hand):
     assert "??" not in (hand / "config.yaml").read_text()
 
 
-@pytest.mark.xdist_group("hand")
 @pytest.mark.slow
 def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, capsys):
     assert command("evaluate.py", f"run='{hand}'", "episodes=2") == 0
@@ -93,7 +91,6 @@ def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, cap
     assert "95% interval" in capsys.readouterr().out
 
 
-@pytest.mark.xdist_group("hand")
 @pytest.mark.slow
 def test_evaluate_draws_a_video_or_says_what_to_install(hand):
     done = process(
@@ -113,7 +110,6 @@ def test_evaluate_draws_a_video_or_says_what_to_install(hand):
             assert (hand / "videos" / name).stat().st_size > 1_000
 
 
-@pytest.mark.xdist_group("hand")
 @pytest.mark.slow
 def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
     decoder, info = load_bundle(hand)  # saved again, as anybody can, without a fact about it
@@ -126,7 +122,6 @@ def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_p
     assert (tmp_path / "run" / "synergies" / "synergies.json").is_file()  # a copy of its own
 
 
-@pytest.mark.xdist_group("hand")
 @pytest.mark.slow
 def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path, capsys):
     settings = ("env=humanoid-stand", f"synergies='{hand}'")

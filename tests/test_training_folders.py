@@ -20,8 +20,6 @@ from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.stage import Stage
 
-pytestmark = pytest.mark.xdist_group("folders")  # most begin with the same finished run
-
 ONLY_AT_THE_END = "checkpoint.every=100000"
 
 

@@ -28,8 +28,6 @@ from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
 
-pytestmark = pytest.mark.xdist_group("resume")  # many compare with the same run
-
 # With all that remembers what was seen, or goes by the frames.
 REMEMBERS = (
     "learn.sac.normalize_observations=true",

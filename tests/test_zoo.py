@@ -33,9 +33,6 @@ def composed(overrides=()):
         return compose("config", overrides=list(overrides))
 
 
-pytestmark = pytest.mark.xdist_group("zoo")  # most begin with the same finished run
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A finished tiny run of both stages."""

@@ -1,0 +1,77 @@
+"""A learner's optimizer and EMA do what PyTorch's do; updates come one after another."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import pytest
+import torch
+from torch.optim import Adam
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from tests.stages import fill, learn_stage
+from torchrl_etl.learners import WarmedUpEMA
+from torchrl_etl.learners.adam import GradientAdam
+
+RATES = (0.1, 0.03)
+
+
+def parameters():
+    torch.manual_seed(0)
+    return [torch.nn.Parameter(torch.randn(3)) for _ in range(3)]
+
+
+def groups(weights):
+    return [
+        {"params": weights[:2], "lr": RATES[0], "weight_decay": 0.1},
+        {"params": weights[2:], "lr": RATES[1], "betas": (0.5, 0.9)},
+    ]
+
+
+@pytest.mark.parametrize("unused", [None, 1])
+def test_a_step_along_gradients_is_adams_step(unused):
+    ours, theirs = parameters(), parameters()
+    optimizer = GradientAdam(groups(ours), fused=True)
+    reference = Adam(groups(theirs), fused=True)
+    for step in range(6):
+        gradients = [None if i == unused else torch.randn(3) for i in range(3)]
+        if step == 3:  # a learning rate falls, and a checkpoint is loaded
+            optimizer.param_groups[0]["lr"] = reference.param_groups[0]["lr"] = 0.02
+            optimizer.load_state_dict(deepcopy(optimizer.state_dict()))
+        optimizer.step_along(gradients)
+        for parameter, gradient in zip(theirs, gradients, strict=True):
+            parameter.grad = gradient
+        reference.step()
+        assert all((a == b).all() for a, b in zip(ours, theirs, strict=True))
+    assert unused is None or (ours[unused] == parameters()[unused]).all()
+
+
+def test_an_ema_past_its_warm_up_is_pytorchs_and_copies_buffers():
+    model = torch.nn.BatchNorm1d(2)
+    ours = WarmedUpEMA(model, decay=0.3)
+    theirs = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(0.3))
+    for step in range(9):
+        torch.nn.init.normal_(model.weight), model.running_mean.fill_(step)
+        ours.follow()
+        if step < 3:  # (1 + n) / (10 + n) passes 0.3 at n = 3
+            theirs.load_state_dict(ours.state_dict())
+        else:
+            theirs.update_parameters(model)
+    assert ours.n_averaged == 9 and (ours.module.weight == theirs.module.weight).all()
+    assert (ours.module.weight != model.weight).all() and (ours.module.running_mean == 8).all()
+
+
+def test_updates_on_several_batches_are_those_on_each_in_turn():
+    at_once, in_turn = learn_stage(), learn_stage()
+    fill(at_once)
+    batches = at_once.samples(3)
+    assert batches.shape == (3, at_once.batch_size)
+    in_turn.learner.objective.load_state_dict(at_once.learner.objective.state_dict())
+    torch.manual_seed(0)
+    together = at_once.learner.updates(batches)
+    torch.manual_seed(0)
+    alone = torch.stack([in_turn.learner.update(batch) for batch in batches])
+    assert (together == alone).all() and together.shape == (3,)
+    ours, theirs = (stage.learner.objective.state_dict() for stage in (at_once, in_turn))
+    assert all((value == theirs[key]).all() for key, value in ours.items())
+    at_once.close(), in_turn.close()
