@@ -31,6 +31,7 @@ from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.command_line import (
     check_overrides,
     one_sentence,
+    print_intervals,
     quiet_torchrl,
     quote_paths,
 )
@@ -77,10 +78,7 @@ def main(config: DictConfig) -> None:
         f"{trained.task['name']}{task.goal_in_words}, deterministic policy, "
         f"{config.episodes} episodes"
     )
-    for key in ("return", "solved", "solved_time"):
-        if key in result:
-            mean, low, high = result[key].values()
-            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+    print_intervals(result)
     if trained.card is not None:
         print(f"  {beside(trained.card, evaluation)}")
     print(f"  written to {path}")

@@ -18,7 +18,13 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrl_etl.checks import check_choice, check_integer
-from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
+from torchrl_etl.command_line import (
+    check_overrides,
+    one_sentence,
+    print_intervals,
+    quiet_torchrl,
+    quote_paths,
+)
 from torchrl_etl.envs import SimulationError, resolve_task
 from torchrl_etl.export import export_run
 from torchrl_etl.synergies.bundle import copy_bundle
@@ -47,10 +53,7 @@ def main(config: DictConfig) -> None:
         card = export_run(run, target, compose, episodes=config.episodes)
     size = sum(path.stat().st_size for path in target.iterdir())
     print(f"{trained.env}{task.goal_in_words}, {card.training['frames']:,} frames")
-    for key in ("return", "solved", "solved_time"):
-        if key in card.evaluation:
-            mean, low, high = card.evaluation[key].values()
-            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+    print_intervals(card.evaluation)
     print(f"  {size / 1e6:.2f} MB in {target}; to load it: zoo.load({str(target)!r})")
 
 

@@ -7,9 +7,10 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.extras import extra
@@ -22,6 +23,7 @@ with extra("recipes"):
 __all__ = [
     "check_overrides",
     "one_sentence",
+    "print_intervals",
     "quiet_torchrl",
     "quote_paths",
     "translate",
@@ -167,6 +169,14 @@ def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
     except kinds as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def print_intervals(summary: Mapping[str, Any]) -> None:
+    """Print return and solved, as :meth:`~torchrl_etl.training.Evaluation.summary` has them."""
+    for key in ("return", "solved", "solved_time"):
+        if key in summary:
+            mean, low, high = summary[key].values()
+            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
 
 
 def quiet_torchrl() -> None:

@@ -43,7 +43,8 @@ class GradientAdam(Adam):
         Which of them are ``None`` must not change.
         """
         if self._walked is None:
-            self._begin(gradients)
+            self.step_once(gradients)  # makes the state to walk over
+            self._walk(gradients)
             return
         for group, at, (parameters, *moments, steps) in self._walked:
             beta1, beta2 = group["betas"]
@@ -60,14 +61,20 @@ class GradientAdam(Adam):
                 **{name: group[name] for name in ("lr", "weight_decay", "eps", "maximize")},
             )
 
-    def _begin(self, gradients: Sequence[Tensor | None]) -> None:
-        """A step of Adam's own, which makes its state, and a walk over that."""
-        parameters = [p for group in self.param_groups for p in group["params"]]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
+    def step_once(self, gradients: Sequence[Tensor | None]) -> None:
+        """The same by Adam's own step, whichever are ``None``."""
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         self.step()
         self.zero_grad()
-        self._walked, index = [], 0
+
+    @property
+    def _parameters(self) -> list[Tensor]:
+        return [parameter for group in self.param_groups for parameter in group["params"]]
+
+    def _walk(self, gradients: Sequence[Tensor | None]) -> None:
+        parameters, index = self._parameters, 0
+        self._walked = []
         for group in self.param_groups:
             at = [i for i, _ in enumerate(group["params"], index) if gradients[i] is not None]
             index += len(group["params"])

@@ -20,7 +20,7 @@ from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_positive, check_real
 from torchrl_etl.learners.adam import GradientAdam
-from torchrl_etl.learners.compiled import compiled, cuda_graph, without_guards
+from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.term import Term
@@ -166,15 +166,8 @@ class SACLearner:
         return scalars
 
     def updates(self, batches: TensorDictBase) -> TensorDictBase:
-        """Learn from batches [k, B], one after the other; returns scalars to log [k].
-
-        Nothing but tensors changes between them, so a compiled update looks at its guards once.
-        """
-        first, *others = batches.unbind(0)
-        scalars = [self.update(first)]
-        with without_guards():
-            scalars += [self.update(batch) for batch in others]
-        return torch.stack(scalars)
+        """Learn from batches [k, B], one after the other; returns scalars to log [k]."""
+        return torch.stack(in_turn(self.update, batches))
 
     def step(self, batch: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
@@ -198,10 +191,7 @@ class SACLearner:
         """One gradient step on a single term, by the same optimizer; returns scalars to log."""
         loss, scalars = term(batch)
         gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
-            parameter.grad = gradient
-        self.optimizer.step()
-        self.optimizer.zero_grad()
+        self.optimizer.step_once(gradients)
         return scalars.detach()
 
     def observe(self, batch: TensorDictBase) -> None:

@@ -13,7 +13,7 @@ from torch.func import functional_call
 from torchrl.checkpoint import GlobalRNGState
 
 from torchrl_etl.draws import Draw, given_draws, recorded_draws
-from torchrl_etl.learners.compiled import compiled, cuda_graph, without_guards
+from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
 from torchrl_etl.learners.sac import SACLearner
 
 __all__ = ["SideBySide"]
@@ -112,9 +112,7 @@ class SideBySide:
             list of TensorDictBase: the scalars [k] of each.
         """
         turns = zip(zip(*batches, strict=True), zip(*draws, strict=True), strict=True)
-        scalars = [self.update(*next(turns))]
-        with without_guards():
-            scalars += [self.update(*turn) for turn in turns]
+        scalars = in_turn(lambda turn: self.update(*turn), turns)
         return [torch.stack(list(own)) for own in zip(*scalars, strict=True)]
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -14,7 +15,7 @@ from torchrl_etl.training.work import Work
 __all__ = ["Method"]
 
 
-class Method:
+class Method(ABC):
     """What a run does before it learns the task, and with which learner it then does.
 
     Args:
@@ -62,14 +63,14 @@ class Method:
         yield from ()
         return {}
 
+    @abstractmethod
     def stage(self) -> Stage:
         """The stage that learns the task, before its first frame.
 
         Before :meth:`prepare` it has placeholders for what that finds.
         """
-        raise NotImplementedError
 
-    def begin(self, stage: Stage) -> None:
+    def begin(self, stage: Stage) -> None:  # noqa: B027 most have nothing to give
         """Give the stage what it has before its first frame; a checkpoint replaces it."""
 
     def actor(self) -> dict[str, Any]:
