@@ -20,7 +20,7 @@ from torchrl.objectives import SoftUpdate
 
 from tests.loss_checks import LossChecks
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM
-from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble
+from torchrl_etl.baselines import EMELoss, RewardEnsemble
 from torchrl_etl.modules import StateEncoder, make_actor
 from torchrl_etl.objectives import FusedSoftUpdate
 
@@ -327,14 +327,6 @@ def test_ensemble_agrees_where_it_has_learned_and_nowhere_else() -> None:
     assert variance(5 * torch.randn(64, 2)) > 30 * variance(data["observation"])
 
 
-def test_members_start_apart() -> None:
-    ensemble = RewardEnsemble(3, 2, 5)
-    data = TensorDict({"observation": torch.randn(4, 3), "action": torch.randn(4, 2)}, [4])
-    predictions = ensemble(data)["reward_prediction"]
-    assert predictions.shape == (4, 5)
-    assert (predictions.var(-1) > 0).all()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -359,8 +351,6 @@ def test_plain_networks_are_refused() -> None:
         wrong = [nn.Linear(2, 2) if i == index else part for i, part in enumerate(parts)]
         with pytest.raises(TypeError, match=f"{name} is a Linear"):
             EMELoss(*wrong)
-    with pytest.raises(ValueError, match="size is 0"):
-        RewardEnsemble(3, 2, 0)
 
 
 def test_one_transition_has_no_pairs() -> None:

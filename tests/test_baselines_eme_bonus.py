@@ -28,8 +28,7 @@ from tests.test_baselines_eme import (
     transitions,
 )
 from tests.transform_checks import TransformChecks
-from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble, diversity_scale
-from torchrl_etl.baselines.eme_bonus import EMEBonus
+from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
 from torchrl_etl.modules import StateEncoder
 
 
@@ -122,16 +121,6 @@ def bonus_of_tables(**options: Any) -> EMEBonus:
 
 def steps(states: list[int], following: list[int], rewards: list[float]) -> TensorDict:
     return transitions(states, following, rewards, [False] * len(states), 3)
-
-
-@pytest.mark.parametrize(
-    ("predictions", "scale"),
-    [([0.0, 1.0], 1.0), ([2.0, 2.0], 1.0), ([0.0, 4.0], 4.0), ([0.0, 10.0], 10.0), ([3.0], 1.0)],
-)
-def test_scale_is_the_variance_between_one_and_the_maximum(
-    predictions: list[float], scale: float
-) -> None:
-    assert diversity_scale(torch.tensor(predictions)).tolist() == [scale]
 
 
 def test_scale_multiplies_the_distance_and_has_a_maximum() -> None:

@@ -2,11 +2,12 @@
 
 from torchrl_etl.baselines.dep import DEPController, DEPExploration
 from torchrl_etl.baselines.dynsyn import GroupedTanhNormal, make_dynsyn_actor, set_frames
-from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble
+from torchrl_etl.baselines.eme import EMELoss
 from torchrl_etl.baselines.eme_bonus import EMEBonus
 from torchrl_etl.baselines.lattice import LatticeNormal, make_lattice_actor
 from torchrl_etl.baselines.lattice_noise import LatticeNoise
 from torchrl_etl.baselines.muscle_groups import group_muscles, record_muscle_lengths
+from torchrl_etl.baselines.reward_ensemble import RewardEnsemble
 from torchrl_etl.baselines.sar import SARDecoder, best_episodes
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""EME (Wang 2024), what it learns: a metric that also compares policies, and a reward ensemble."""
+"""EME (Wang 2024), what it learns: a metric that also compares policies."""
 
 from __future__ import annotations
 
@@ -8,103 +8,19 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-    dispatch,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
-from torchrl.modules import MLP
+from torch import Tensor
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice, check_positive
+from torchrl_etl.checks import check_choice
 from torchrl_etl.draws import standard_uniform
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 
-__all__ = ["EMELoss", "RewardEnsemble", "diversity_scale"]
-
-
-def diversity_scale(predictions: Tensor, maximum: float = 10.0) -> Tensor:
-    r"""EME's scaling factor: how much an ensemble disagrees on the reward, kept in ``[1, M]``.
-
-    .. math:: \min(\max(\mathrm{Var}_k\, \hat r_k(s, a),\, 1),\, M)
-
-    Args:
-        predictions (Tensor): what each member predicts, ``[*, K]``.
-        maximum (float, optional): M, at least 1. Defaults to ``10.0``.
-
-    Returns:
-        Tensor: factors, ``[*, 1]``.
-
-    Deviates: which variance is not said; this is the population's (divided by K).
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_etl.baselines.eme import diversity_scale
-        >>> diversity_scale(torch.tensor([[0.0, 1.0], [0.0, 4.0], [0.0, 10.0]])).flatten()
-        tensor([ 1.,  4., 10.])
-    """
-    return predictions.var(-1, correction=0, keepdim=True).clamp(1.0, maximum)
-
-
-class _Members(nn.ModuleList):
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        inputs = torch.cat([observation, action], -1)
-        return torch.cat([member(inputs) for member in self], -1)
-
-
-class RewardEnsemble(TensorDictModule):
-    """Reward predictors r̂_k(s, a), each with an initialisation of its own.
-
-    Args:
-        observation_dim (int): size O of the observation.
-        action_dim (int): number n of actuators.
-        size (int): members K. With one the variance is zero and EME's scale always 1.
-            Default: ``6``.
-
-    Keyword Args:
-        hidden (sequence of int): widths of the hidden layers. Default: ``(256, 256)``.
-        in_keys (sequence of NestedKey): observation and action, in this order.
-        out_keys (sequence of NestedKey): the predictions.
-
-    Keys:
-        reads ``observation`` [*, O] and ``action`` [*, n]; writes ``reward_prediction`` [*, K] in
-        units of the reward.
-
-    Raises:
-        ValueError: if a size is not positive.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_etl.baselines.eme import RewardEnsemble
-        >>> ensemble = RewardEnsemble(observation_dim=7, action_dim=5)
-        >>> data = TensorDict({"observation": torch.randn(3, 7), "action": torch.randn(3, 5)}, [3])
-        >>> ensemble(data)["reward_prediction"].shape
-        torch.Size([3, 6])
-    """
-
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        size: int = 6,
-        *,
-        hidden: Sequence[int] = (256, 256),
-        in_keys: Sequence[NestedKey] = ("observation", "action"),
-        out_keys: Sequence[NestedKey] = ("reward_prediction",),
-    ) -> None:
-        check_positive(observation_dim=observation_dim, action_dim=action_dim, size=size)
-        members = _Members(
-            MLP(observation_dim + action_dim, 1, num_cells=list(hidden), activation_class=nn.ReLU)
-            for _ in range(size)
-        )
-        super().__init__(members, in_keys=list(in_keys), out_keys=list(out_keys))
+__all__ = ["EMELoss"]
 
 
 class EMELoss(LossModule):
@@ -150,8 +66,9 @@ class EMELoss(LossModule):
 
     Args:
         encoder (TensorDictModule): φ; its first out key is the embedding [*, k].
-        ensemble (TensorDictModule): the reward predictors, such as :class:`RewardEnsemble`; its
-            first out key holds one prediction for each member [*, K].
+        ensemble (TensorDictModule): the reward predictors, such as
+            :class:`~torchrl_etl.baselines.reward_ensemble.RewardEnsemble`; its first out key holds
+            one prediction for each member [*, K].
         actor (ProbabilisticTensorDictSequential): the policy that is being learned. It is held by
             reference: it gets no gradient, and neither ``parameters()`` nor ``state_dict()`` of
             the loss contain it.
@@ -182,7 +99,7 @@ class EMELoss(LossModule):
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_etl.baselines.eme import EMELoss, RewardEnsemble
+        >>> from torchrl_etl.baselines import EMELoss, RewardEnsemble
         >>> from torchrl_etl.modules import StateEncoder, make_actor
         >>> actor = make_actor({"observation": 7}, Bounded(-1, 1, shape=(5,)))
         >>> loss = EMELoss(StateEncoder(7, 4), RewardEnsemble(7, 5), actor)

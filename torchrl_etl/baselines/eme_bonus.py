@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from torchrl_etl import functional
-from torchrl_etl.baselines.eme import diversity_scale
+from torchrl_etl.baselines.reward_ensemble import diversity_scale
 from torchrl_etl.modules.running_deviation import RunningDeviation
 from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
@@ -72,8 +72,7 @@ class EMEBonus(TransitionReward):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_etl.baselines.eme import RewardEnsemble
-        >>> from torchrl_etl.baselines.eme_bonus import EMEBonus
+        >>> from torchrl_etl.baselines import EMEBonus, RewardEnsemble
         >>> from torchrl_etl.modules import StateEncoder
         >>> bonus = EMEBonus(StateEncoder(3, 2), RewardEnsemble(3, 1), weight=0.1)
         >>> data = TensorDict({"observation": torch.randn(8, 3), "action": torch.randn(8, 1)}, [8])
