@@ -34,6 +34,7 @@ from torchrl_etl.command_line import (
 )
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.layout import choose_layout
 from torchrl_etl.training import Interrupted, resumed_config, together
 from torchrl_etl.training.config import of_each_seed
 from torchrl_etl.training.loop import StopOnSignal
@@ -82,14 +83,19 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[Experiment]:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
         defaults = hydra.compose("config")
         for folder in map(Path, folders):
-            stored = resumed_config(folder, given, defaults=defaults)
+            stored = settled(resumed_config(folder, given, defaults=defaults))
             yield Experiment(stored, resume=folder, say=print)
         return
     # Two runs that begin in the same second have the same name by default.
     named = any(override.lstrip("+").startswith("run_dir=") for override in given)
-    for own in of_each_seed(config):
+    for own in of_each_seed(settled(config)):
         prefix = "" if config.seeds is None else f"seed {own.seed}: "
         yield Experiment(own, unique=not named, say=lambda line, p=prefix: print(f"{p}{line}"))
+
+
+def settled(config: DictConfig) -> DictConfig:
+    """The configuration with a collector, also where that is left to be found out."""
+    return choose_layout(config, say=print) if config.collector.kind == "auto" else config
 
 
 def report(summary: dict[str, Any], folder: Path) -> str:
