@@ -11,16 +11,14 @@ from torchrl_etl.analysis.diagnostics import (
     control_authority,
     direction_alignment,
     mixture_usage,
-    nmf_vaf,
-    pca_vaf,
     synergy_effects,
     synergy_warnings,
-    variance_accounted_for,
 )
 from torchrl_etl.analysis.joint_effects import JointEffects, joint_effects
 from torchrl_etl.analysis.pictures import embedding, learning_curves, synergy_heatmap, vaf_curve
 from torchrl_etl.analysis.statistics import Interval, interval, success_interval
 from torchrl_etl.analysis.synergy_report import describe_synergies, draw_synergies
+from torchrl_etl.analysis.variance import nmf_vaf, pca_vaf, variance_accounted_for
 
 __all__ = [
     "CrossValidation",

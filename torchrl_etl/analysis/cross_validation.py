@@ -10,7 +10,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchrl_etl.analysis.diagnostics import as_matrix, variance_accounted_for
+from torchrl_etl.analysis.arrays import as_matrix
+from torchrl_etl.analysis.variance import variance_accounted_for
 from torchrl_etl.checks import check_integer
 from torchrl_etl.synergies import SynergyModel
 

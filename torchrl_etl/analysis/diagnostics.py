@@ -1,8 +1,7 @@
-"""Numbers that tell whether a synergy space is worth learning in."""
+"""Numbers that tell whether a synergy space is worth learning in, and warnings in words."""
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -10,141 +9,19 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchrl_etl.extras import extra
+from torchrl_etl.analysis.arrays import as_array, as_matrix
 
 if TYPE_CHECKING:
     from torchrl_etl.modules import GMVAE, SynergyDecoder
 
 __all__ = [
     "MixtureUsage",
-    "as_matrix",
     "control_authority",
     "direction_alignment",
     "mixture_usage",
-    "nmf_vaf",
-    "pca_vaf",
     "synergy_effects",
     "synergy_warnings",
-    "variance_accounted_for",
 ]
-
-
-def variance_accounted_for(
-    actions: Tensor | ArrayLike, reconstruction: Tensor | ArrayLike
-) -> float:
-    """Variance accounted for: 1 − Σ‖a − â‖² / Σ‖a − ā‖², with ā the mean action.
-
-    1 is a perfect reconstruction, 0 is no better than always answering the mean action, and less
-    than 0 is worse than that. Constant actions have no variance to account for: the result is then
-    1 if they are reconstructed to rounding error, else 0.
-
-    Args:
-        actions (Tensor or array): actions [*, n].
-        reconstruction (Tensor or array): their reconstructions, of the same shape.
-
-    Raises:
-        ValueError: if the shapes differ, there are no actions, or a number is not finite.
-
-    Examples:
-        >>> variance_accounted_for([[0.0], [2.0], [4.0]], [[1.0], [2.0], [3.0]])
-        0.75
-    """
-    actions = as_matrix(actions, "actions")
-    reconstruction = as_matrix(reconstruction, "reconstruction")
-    if actions.shape != reconstruction.shape:
-        raise ValueError(
-            f"actions flatten to {actions.shape} but reconstruction to {reconstruction.shape}; "
-            "pass one reconstructed action per action."
-        )
-    missed = float(np.square(actions - reconstruction).sum())
-    total = float(np.square(actions - actions.mean(0)).sum())
-    # Rounding leaves a constant column a variance of some (1e-16)² relative to its size, and
-    # float32 data a residual of (1e-7)².
-    size = float(np.square(actions).sum())
-    if total <= 1e-24 * size:
-        return 1.0 if missed <= 1e-12 * size else 0.0
-    return 1.0 - missed / total
-
-
-def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int = 50_000) -> float:
-    """Variance that the best ``num_synergies`` linear directions account for.
-
-    No linear decoder with an offset can do better on these actions, so a nonlinear one should.
-
-    Args:
-        actions (Tensor or array): actions [*, n].
-        num_synergies (int): number d of principal components.
-
-    Keyword Args:
-        max_samples (int): more actions than this are subsampled, with a fixed seed.
-
-    Raises:
-        ValueError: if d exceeds the number of actuators or actions, or an action is not finite.
-
-    Examples:
-        >>> round(pca_vaf([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]], num_synergies=1), 6)
-        1.0
-    """
-    actions = _subsample(as_matrix(actions, "actions"), max_samples)
-    _check_rank(num_synergies, actions)
-    with extra("synergies"):
-        from sklearn.decomposition import PCA
-    # scikit-learn divides by the total variance on its way, which constant actions do not have;
-    # the components are good either way.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        model = PCA(num_synergies, svd_solver="covariance_eigh").fit(actions)
-    return variance_accounted_for(actions, model.inverse_transform(model.transform(actions)))
-
-
-def nmf_vaf(
-    actions: Tensor | ArrayLike,
-    num_synergies: int,
-    low: float | Tensor | ArrayLike = -1.0,
-    *,
-    max_samples: int = 5_000,
-) -> float:
-    """Variance that non-negative matrix factorisation with ``num_synergies`` parts accounts for.
-
-    This is how motor control research extracts muscle synergies from recordings. It sees a − low,
-    which is never negative; the variance is still taken about the mean action, so the number
-    compares with the other two. NMF has no offset of its own: with few parts it can fall below 0.
-
-    Args:
-        actions (Tensor or array): actions [*, n].
-        num_synergies (int): number d of parts.
-        low (float, Tensor or array): lower action bound, one or [n]. Default: -1.
-
-    Keyword Args:
-        max_samples (int): more actions than this are subsampled, with a fixed seed.
-
-    Raises:
-        ValueError: if an action is below ``low``, d exceeds the number of actuators or actions, or
-            an action is not finite.
-
-    Examples:
-        >>> parts = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5]])
-        >>> weights = torch.rand(64, 2, generator=torch.Generator().manual_seed(0))
-        >>> round(nmf_vaf(weights @ parts, num_synergies=2, low=0.0), 2)
-        1.0
-    """
-    actions = _subsample(as_matrix(actions, "actions"), max_samples)
-    _check_rank(num_synergies, actions)
-    shifted = actions - _array(low)
-    if shifted.min() < -1e-4:
-        raise ValueError(
-            f"An action lies {-shifted.min():.3g} below the lower bound; pass the bound of these "
-            "actions' own spec as low."
-        )
-    shifted = shifted.clip(min=0.0)
-    with extra("synergies"):
-        from sklearn.decomposition import NMF
-        from sklearn.exceptions import ConvergenceWarning
-    model = NMF(num_synergies, init="nndsvda", max_iter=500, random_state=0)
-    with warnings.catch_warnings():
-        # The last digits that more iterations would bring do not change a verdict.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        weights = model.fit_transform(shifted)
-    return variance_accounted_for(shifted, weights @ model.components_)
 
 
 @torch.no_grad()
@@ -325,7 +202,7 @@ def synergy_warnings(
             f"The {name} accounts for {vaf:.1%} of the actions' variance, less than PCA's "
             f"{pca_vaf:.1%} with as many dimensions{_CURES.get(kind, _CURE)}."
         )
-    authority = _array(authority)
+    authority = as_array(authority)
     if authority.mean() < min_authority:
         still = int((authority < 0.01).sum())
         idle = f"; {still} of {authority.size} actuators move less than 1%" if still else ""
@@ -346,40 +223,3 @@ def synergy_warnings(
 def _decode(decoder: SynergyDecoder, synergies: Tensor) -> Tensor:
     silent = synergies.new_zeros(len(synergies), decoder.synergy_dim - decoder.num_synergies)
     return decoder(torch.cat([synergies, silent], -1).to(decoder.low.device))
-
-
-def _array(values: Tensor | ArrayLike) -> np.ndarray:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
-    return np.asarray(values, dtype=np.float64)
-
-
-def as_matrix(values: Tensor | ArrayLike, name: str) -> np.ndarray:
-    """Finite numbers [*, n] as a float64 array [N, n]; ``name`` is what an error calls them.
-
-    Examples:
-        >>> as_matrix(torch.zeros(2, 3, 4), "actions").shape
-        (6, 4)
-    """
-    array = _array(values)
-    if array.ndim < 2 or array.size == 0:
-        raise ValueError(
-            f"{name} have shape {array.shape}; at least one action is needed, as an array [*, n]."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} hold numbers that are not finite; drop those rows first.")
-    return array.reshape(-1, array.shape[-1])
-
-
-def _subsample(actions: np.ndarray, count: int) -> np.ndarray:
-    if len(actions) <= count:
-        return actions
-    return actions[np.random.default_rng(0).choice(len(actions), count, replace=False)]
-
-
-def _check_rank(num_synergies: int, actions: np.ndarray) -> None:
-    if not 1 <= num_synergies <= min(actions.shape):
-        raise ValueError(
-            f"num_synergies is {num_synergies}; with {len(actions)} actions of "
-            f"{actions.shape[1]} actuators it must lie in 1..{min(actions.shape)}."
-        )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchrl_etl.analysis.diagnostics import as_matrix
+from torchrl_etl.analysis.arrays import as_matrix
 
 __all__ = ["JointEffects", "joint_effects"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from torchrl_etl.analysis.arrays import as_matrix
 from torchrl_etl.analysis.canvas import direction_colors, new_figure, tidy, write
-from torchrl_etl.analysis.diagnostics import as_matrix
 from torchrl_etl.extras import extra
 
 if TYPE_CHECKING:

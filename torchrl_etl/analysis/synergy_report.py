@@ -9,15 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_etl.analysis.diagnostics import (
-    control_authority,
-    mixture_usage,
-    nmf_vaf,
-    pca_vaf,
-    synergy_warnings,
-    variance_accounted_for,
-)
+from torchrl_etl.analysis.diagnostics import control_authority, mixture_usage, synergy_warnings
 from torchrl_etl.analysis.pictures import synergy_heatmap, vaf_curve
+from torchrl_etl.analysis.variance import nmf_vaf, pca_vaf, variance_accounted_for
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import GMVAESynergies, SynergyModel
 
