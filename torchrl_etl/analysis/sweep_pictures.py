@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchrl_etl.analysis.bootstrap import mean_band
 from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figure, tidy, write
 from torchrl_etl.analysis.published import (
     PublishedCurve,
@@ -22,7 +23,7 @@ from torchrl_etl.analysis.published import (
     published_curves,
 )
 from torchrl_etl.analysis.sweep_results import SweepRun
-from torchrl_etl.analysis.sweep_statistics import OverallResult, mean_band
+from torchrl_etl.analysis.sweep_statistics import OverallResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,25 +1,17 @@
-"""What a sweep's runs say at an equal number of frames: interquartile means and comparisons.
-
-The estimators are those of Agarwal et al., "Deep reinforcement learning at the edge of the
-statistical precipice" (2021), and the intervals come from the authors' library, rliable: seeds are
-resampled within each task, so tasks stay as they are.
-"""
+"""What a sweep's runs say at an equal number of frames, task by task and over all tasks."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from torchrl_etl.analysis.bootstrap import iqm, probability_of_improvement
 from torchrl_etl.analysis.published import best_published, environment_id
 from torchrl_etl.analysis.statistics import Interval
 from torchrl_etl.analysis.sweep_results import SweepRun
-from torchrl_etl.extras import extra
 
 __all__ = [
     "Comparison",
@@ -28,97 +20,13 @@ __all__ = [
     "Scale",
     "common_budget",
     "compare",
-    "iqm",
-    "mean_band",
     "normalize",
     "overall",
-    "probability_of_improvement",
 ]
 
 # An evaluation so far below the budget, as a share of it, still stands for the budget: episodes
 # end at will, so evaluations fall on slightly different frames.
 _TOLERANCE = 0.05
-
-
-def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
-    """Interquartile mean of the runs of all tasks, with its stratified bootstrap 95 % interval.
-
-    Args:
-        groups (sequence of array-like): for each task, one number per seed; their numbers of seeds
-            may differ.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples. Default: 2000.
-
-    Returns:
-        Interval: the ends are NaN where a task has one seed, which says nothing about its spread.
-
-    Examples:
-        >>> iqm([[1.0, 2.0, 3.0, 100.0]], repetitions=50).mean
-        2.5
-    """
-    return _interval(
-        _pooled_iqm, [np.asarray(group, float) for group in groups], repetitions=repetitions
-    )
-
-
-def probability_of_improvement(
-    pairs: Sequence[tuple[ArrayLike, ArrayLike]], *, repetitions: int = 2000
-) -> Interval:
-    """How often a run of one method beats a run of another on the same task, mean over tasks.
-
-    Args:
-        pairs (sequence of pairs of array-like): for each task, the one's and the other's numbers,
-            one per seed. A tie counts one half.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples; 0 leaves the interval away. Default: 2000.
-
-    Returns:
-        Interval: the ends are NaN where one of them has one seed on a task.
-
-    Equation:
-        1/T Σ_t 1/(N_t K_t) Σ_i Σ_j (1[x_ti > y_tj] + ½ 1[x_ti = y_tj]); what rliable computes by
-        way of the Mann-Whitney statistic, without its test, which would be most of the time here.
-
-    Examples:
-        >>> probability_of_improvement([([1.0, 3.0], [2.0, 2.0])], repetitions=0).mean
-        0.5
-    """
-    groups = [np.asarray(group, float) for pair in pairs for group in pair]
-    return _interval(_improvement, groups, repetitions=repetitions)
-
-
-def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of a band around the mean over seeds.
-
-    Args:
-        values (np.ndarray): one row per seed, one column per evaluation.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples. Default: 2000.
-
-    Returns:
-        tuple of np.ndarray: the percentile bootstrap's 95 % interval from three seeds up; smallest
-        and largest value of two seeds, or of one.
-
-    Examples:
-        >>> [end.tolist() for end in mean_band(np.array([[1.0, 2.0], [3.0, 2.0]]))]
-        [[1.0, 2.0], [3.0, 2.0]]
-    """
-    if len(values) < 3:
-        return values.min(axis=0), values.max(axis=0)
-    with extra("statistics"):
-        from scipy.stats import bootstrap
-    ends = bootstrap(
-        (values,),
-        np.mean,
-        axis=0,
-        n_resamples=repetitions,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return ends.low, ends.high
 
 
 @dataclass(frozen=True)
@@ -314,7 +222,7 @@ def overall(
                 tuple(c.setting for c, _ in own),
                 missing,
                 iqm(_normalized(own, method), repetitions=repetitions),
-                _pooled_iqm(*_normalized(own, control)).item() if shared else None,
+                iqm(_normalized(own, control), repetitions=0).mean if shared else None,
                 probability_of_improvement(pairs, repetitions=repetitions)
                 if pairs and method != control
                 else None,
@@ -363,44 +271,3 @@ def _first_at(runs: Sequence[SweepRun], target: float, budget: int) -> int | Non
 def _stale(run: SweepRun, budget: int) -> bool:
     row = run.at(budget)
     return row is None or row.frames < (1 - _TOLERANCE) * budget
-
-
-def _pooled_iqm(*groups: np.ndarray) -> np.ndarray:
-    with extra("statistics"):
-        from rliable import metrics
-    return np.array([metrics.aggregate_iqm(np.concatenate(groups))])
-
-
-def _improvement(*groups: np.ndarray) -> np.ndarray:
-    """Groups alternate between the one's runs and the other's, task by task."""
-    pairs = zip(groups[::2], groups[1::2], strict=True)
-    # The mean sign of all differences lies in [-1, 1], a tie at 0.
-    wins = [0.5 + 0.5 * np.sign(x.ravel()[:, None] - y.ravel()).mean() for x, y in pairs]
-    return np.array([np.mean(wins)])
-
-
-def _interval(
-    statistic: Callable[..., np.ndarray], groups: Sequence[np.ndarray], *, repetitions: int
-) -> Interval:
-    point = float(statistic(*groups)[0])
-    if repetitions == 0 or min(map(len, groups)) < 2:
-        return Interval(point, math.nan, math.nan)
-    with extra("statistics"):
-        from rliable import library
-    # One array per task rather than one matrix: numbers of seeds may differ.
-    scores = [group[:, None] for group in groups]
-    with _seeded():
-        _, ends = library.get_interval_estimates({"": scores}, statistic, reps=repetitions)
-    low, high = np.ravel(ends[""]).tolist()
-    return Interval(point, low, high)
-
-
-@contextmanager
-def _seeded() -> Iterator[None]:
-    """rliable resamples with NumPy's global generator: seed it, and leave it as it was."""
-    state = np.random.get_state()
-    np.random.seed(0)
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
