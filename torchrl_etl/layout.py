@@ -1,16 +1,16 @@
-"""Which processes collect and how many threads learn, chosen by what both take on this machine."""
+"""Which processes collect and how many threads learn: tried out before a run begins."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from statistics import median
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import alone
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -19,38 +19,49 @@ if TYPE_CHECKING:
 
 __all__ = ["Layout", "choose_layout", "layouts"]
 
-CLEARLY_FASTER = 1.1  # what another process must promise to be worth it
+CLEARLY_FASTER = 1.05  # what processes of their own must gain to be worth it
 
 
 class Layout(NamedTuple):
-    """Workers that collect (0: the learner's process does), threads that learn, and what to expect.
+    """A way to share the cores.
 
     Attributes:
-        num_workers (int): processes of their own, one batch ahead of the learner.
+        num_workers (int): processes that collect, one batch ahead; 0: the learner's process does,
+            in turn with learning.
         threads (int): of PyTorch in the learner's process.
-        frames_per_second (float): of both together.
     """
 
     num_workers: int
     threads: int
-    frames_per_second: float
+
+    @property
+    def collector(self) -> dict[str, str | int | bool]:
+        """What the configuration's section of this name says then."""
+        kind, workers = ("process", self.num_workers) if self.num_workers else ("single", 1)
+        return {"kind": kind, "num_workers": workers, "ahead": self.num_workers > 0}
+
+    def __str__(self) -> str:
+        workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}, "
+        kind = "process, " + workers if self.num_workers else "single, "
+        return f"{kind}{self.threads} thread{'s' * (self.threads > 1)}"
 
 
 def choose_layout(
-    config: DictConfig, *, seconds: float = 0.5, say: Callable[[str], None] = lambda line: None
+    config: DictConfig, *, seconds: float = 2.0, say: Callable[[str], None] = lambda line: None
 ) -> DictConfig:
     """The configuration with ``collector.kind=auto`` and ``threads`` settled for this machine.
 
-    Collects and learns with the run's own networks and simulators, a moment each, and reckons with
-    :func:`layouts` what they do together. Updates are measured uncompiled. A ``threads`` that is
-    given is kept. What is chosen belongs to the run: it is saved with its configuration.
+    Trains with the run's own networks, simulators and replay ratio in each of :func:`layouts` for
+    a moment, compiled if the run will be, and takes the fastest. Nothing of that training is kept:
+    the run is the one that the chosen settings give. They are saved with its configuration.
 
     Args:
-        config (DictConfig): see ``recipes/conf/config.yaml``.
+        config (DictConfig): see ``recipes/conf/config.yaml``. A number of threads that it gives is
+            kept.
 
     Keyword Args:
-        seconds (float): for each measurement. Default: 0.5.
-        say (callable): told in one line what was chosen and why.
+        seconds (float): to train in each. Default: 2.
+        say (callable): told in one line what was measured and chosen.
 
     Raises:
         ValueError: if the configuration is not one that can run, or asks for several seeds, which
@@ -58,74 +69,54 @@ def choose_layout(
     """
     if config.seeds is not None:
         raise ValueError(
-            "collector=auto measures one run but seeds asks for several at once; choose "
+            "collector=auto tries out one run but seeds asks for several at once; choose "
             "collector=process."
         )
-    config, trial = config.copy(), config.copy()
-    trial.collector.kind, trial.collector.ahead, trial.compile = "single", False, False
-    trial.learn.buffer_storage, trial.learn.buffer_size = "memory", 4096
-    cores = available_cores()
-    workers = [2**power for power in range(cores.bit_length()) if 2**power < cores]
-    batch, num_envs = config.collector.frames_per_batch, config.collector.num_envs
-    workers = [number for number in workers if batch % (number * num_envs) == 0]
-    threads = {0: config.threads or cores}
-    threads |= {number: config.threads or cores - number for number in workers}
-
-    stage = Experiment(trial).method.stage()
+    per_worker, batch = config.collector.num_envs, config.collector.frames_per_batch
+    candidates = layouts(available_cores(), batch // per_worker, config.threads)
+    trial = config.copy()
+    trial.collector.update(candidates[0].collector)
+    trial.learn.update({"buffer_storage": "memory", "buffer_size": 4096, "learning_starts": 0})
+    before, stage = torch.get_num_threads(), Experiment(trial).method.stage()
     try:
-        frame = seconds_a_frame(stage, seconds)
-        update = seconds_an_update(stage, seconds, set(threads.values()))
+        speeds = {each: frames_per_second(stage, each, seconds) for each in candidates}
     finally:
         stage.close()
-    found = layouts(frame, update, threads, stage.replay_ratio)
-    fastest = max(found, key=lambda layout: layout.frames_per_second)
-    in_process = found[0]
-    if fastest.frames_per_second < CLEARLY_FASTER * in_process.frames_per_second:
-        fastest = in_process
-
-    config.threads = fastest.threads
-    collector = config.collector
-    collector.kind = "process" if fastest.num_workers else "single"
-    collector.ahead, collector.num_workers = fastest.num_workers > 0, max(1, fastest.num_workers)
-    took = ", ".join(f"{1e3 * update[n]:.3g} ms with {n} thread(s)" for n in sorted(update))
-    say(
-        f"collector=auto: {collector.kind}, num_workers={collector.num_workers}, "
-        f"threads={config.threads} (a frame takes {1e3 * frame:.2g} ms, an update {took}, "
-        f"uncompiled; {fastest.frames_per_second:.0f} frames/s, in one process "
-        f"{in_process.frames_per_second:.0f})"
-    )
-    return config
+        torch.set_num_threads(before)
+    best = max(speeds, key=speeds.get)
+    if speeds[best] < CLEARLY_FASTER * speeds[candidates[0]]:
+        best = candidates[0]
+    found = "; ".join(f"{each}: {speed:.0f}" for each, speed in speeds.items())
+    say(f"collector=auto takes {best} (frames/s: {found})")
+    chosen = config.copy()
+    chosen.threads = best.threads
+    chosen.collector.update(best.collector)
+    return chosen
 
 
-def layouts(
-    frame: float, update: Mapping[int, float], threads: Mapping[int, int], replay_ratio: float
-) -> list[Layout]:
-    """What to expect of each way to share the cores.
+def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[Layout]:
+    """Ways to share so many cores, that of one process first.
 
-    In one process collecting and learning take turns; workers collect while the learner learns, so
-    that the slower of the two counts.
+    Beside workers the learner has the cores that they leave, or all: workers that are ahead wait.
 
     Args:
-        frame (float): seconds to collect a frame.
-        update (mapping): seconds of an update, by threads.
-        threads (mapping): threads that learn beside so many workers.
-        replay_ratio (float): updates a frame.
+        cores (int): cores of the machine.
+        most_workers (int): workers that can share a batch; a power of two of them does.
+        threads (int, optional): of the learner in all of them.
 
     Examples:
-        >>> layouts(0.001, {1: 0.012, 2: 0.008}, {0: 2, 1: 1}, replay_ratio=1.0)[0].num_workers
-        0
-        >>> [round(each.frames_per_second) for each in
-        ...  layouts(0.001, {1: 0.012, 2: 0.008}, {0: 2, 1: 1}, replay_ratio=1.0)]
-        [111, 83]
-        >>> [round(each.frames_per_second) for each in
-        ...  layouts(0.001, {1: 0.012, 2: 0.008}, {0: 2, 1: 1}, replay_ratio=0.0625)]
-        [667, 1000]
+        >>> for layout in layouts(2, most_workers=8):
+        ...     print(layout)
+        single, 2 threads
+        process, 1 worker, 1 thread
+        process, 1 worker, 2 threads
     """
-    found = []
-    for workers, count in threads.items():
-        learning = replay_ratio * update[count]
-        seconds = max(frame / workers, learning) if workers else frame + learning
-        found.append(Layout(workers, count, 1 / seconds))
+    found = [Layout(0, threads or cores)]
+    workers = 1
+    while workers < cores and most_workers % workers == 0:
+        left = [threads] if threads else [cores - workers, cores]
+        found += [Layout(workers, count) for count in left]
+        workers *= 2
     return found
 
 
@@ -135,33 +126,18 @@ def available_cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def seconds_a_frame(stage: Stage, seconds: float) -> float:
-    """What it takes to collect one in this process, policy and transforms included."""
+def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
+    """How fast a stage trains in a layout."""
+    torch.set_num_threads(layout.threads)
+    stage.collect_from(**layout.collector)
     stage.restart_collection()
-    while len(stage.buffer) < 2:  # the first call builds what later ones use; n steps hold back
-        before = stage.frames
+
+    def step() -> None:
         stage.collect()
-    return seconds_a_call(stage.collect, seconds) / (stage.frames - before)
+        alone(stage.learn())
 
-
-def seconds_an_update(stage: Stage, seconds: float, threads: Iterable[int]) -> dict[int, float]:
-    """What an update takes, by threads."""
-    taken, before = {}, torch.get_num_threads()
-    try:
-        for count in threads:
-            torch.set_num_threads(count)
-            stage.update()
-            taken[count] = seconds_a_call(stage.update, seconds)
-    finally:
-        torch.set_num_threads(before)
-    return taken
-
-
-def seconds_a_call(call: Callable[[], object], seconds: float) -> float:
-    """The median of as many calls as fit: other processes must not decide."""
-    taken: list[float] = []
-    while sum(taken) < seconds or len(taken) < 3:
-        begun = time.perf_counter()
-        call()
-        taken.append(time.perf_counter() - begun)
-    return median(taken)
+    step()  # compiles, and lets workers begin the batch that is ahead
+    begun, before = time.perf_counter(), stage.frames
+    while time.perf_counter() - begun < seconds or stage.frames == before:
+        step()
+    return (stage.frames - before) / (time.perf_counter() - begun)

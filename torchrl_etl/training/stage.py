@@ -259,6 +259,13 @@ class Stage:
             GlobalRNGState().load_state_dict(random)
         self.batches.restart(seed)
 
+    def collect_from(self, **collector: Any) -> None:
+        """Collect by other arguments of :func:`~torchrl_etl.collectors.make_batches`, from the next
+        :meth:`restart_collection` on.
+        """
+        self._close_batches()
+        self._make_batches = partial(self._make_batches, **collector)
+
     def checkpoint(self) -> Checkpoint:
         """Everything the stage needs to go on, as a TorchRL checkpoint."""
         parts = {**self.learner.parts, "progress": self.progress, "rng": GlobalRNGState()}
@@ -266,14 +273,17 @@ class Stage:
         return Checkpoint(**parts).register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:
+        self._close_batches()
+        if isinstance(self.buffer.storage, LazyMemmapStorage):
+            shutil.rmtree(self.buffer.storage.scratch_dir, ignore_errors=True)
+
+    def _close_batches(self) -> None:
         if self.batches is not None:
             self.batches.close()
             # Simulators hold 100 MB each and sit in reference cycles: do not wait for the
             # garbage collector to come by.
             self.batches = None
             gc.collect()
-        if isinstance(self.buffer.storage, LazyMemmapStorage):
-            shutil.rmtree(self.buffer.storage.scratch_dir, ignore_errors=True)
 
 
 def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
