@@ -1,4 +1,4 @@
-"""LatentAction passes what SynergyAction passes, with modules and specs of any kind."""
+"""LatentAction: the check list, in processes too, with modules and specs of any kind."""
 
 import pytest
 import torch
@@ -8,20 +8,20 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests import test_transforms_synergy_action as synergy
+from tests.latent_action_checks import D, LatentActionChecks, fixed_decoder
 from tests.point_env import ACTION_DIM, PointEnv
-from torchrl_etl.transforms import LatentAction
+from torchrl_etl.transforms import LatentAction, SynergyAction
 
-SPEC = Bounded(-1, 1, shape=(synergy.D,))
+SPEC = Bounded(-1, 1, shape=(D,))
 
 
 def fixed_module(key="action"):
     """The network of the decoder that the checks of values know, without its attributes."""
-    return TensorDictModule(synergy.fixed_decoder().module, ["z"], [key])
+    return TensorDictModule(fixed_decoder().module, ["z"], [key])
 
 
-class TestLatentAction(synergy.TestSynergyAction):
-    synergy_key = "latent"
+class TestLatentAction(LatentActionChecks):
+    latent_key = "latent"
 
     @staticmethod
     def transform(nested=False):
@@ -34,8 +34,14 @@ class TestLatentAction(synergy.TestSynergyAction):
             )
         return LatentAction(fixed_module(), SPEC)
 
-    # Collectors in other processes start slowly and would tell nothing beyond the parent class.
-    test_two_collector_workers_collect = None
+    @classmethod
+    def worker_envs(cls):
+        """LatentAction in one worker and its subclass in the other: workers start slowly."""
+        return [cls.env, cls.of_synergies]
+
+    @staticmethod
+    def of_synergies():
+        return TransformedEnv(PointEnv(), SynergyAction(fixed_decoder(), synergy_key="latent"))
 
 
 def shifting(size, shape=()):
@@ -58,7 +64,7 @@ def test_a_latent_of_numbered_choices_moves_the_env_by_its_rows(batch_size):
 
 @pytest.mark.parametrize("place", [lambda t: t, lambda t: Compose(StepCounter(), t)])
 def test_a_module_of_another_width_is_refused_at_attachment(place):
-    module = TensorDictModule(nn.Linear(synergy.D, 7), ["z"], ["action"])
+    module = TensorDictModule(nn.Linear(D, 7), ["z"], ["action"])
     with pytest.raises(ValueError, match=r"makes actions of shape \[7\] .* 'action' has \[5\]"):
         TransformedEnv(PointEnv(), place(LatentAction(module, SPEC)))
 

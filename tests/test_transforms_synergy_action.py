@@ -1,58 +1,21 @@
+"""SynergyAction: the check list, whose weights act, what it refuses."""
+
 import re
-from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
-from torchrl.data import (
-    Categorical,
-    Composite,
-    LazyTensorStorage,
-    MultiStep,
-    ReplayBuffer,
-    TensorDictReplayBuffer,
-)
-from torchrl.envs import (
-    ActionScaling,
-    Compose,
-    GymEnv,
-    MultiStepTransform,
-    PendulumEnv,
-    RenameTransform,
-    SerialEnv,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-)
-from torchrl.envs.utils import check_env_specs
+from torchrl.data import Categorical, Composite
+from torchrl.envs import Compose, PendulumEnv, SerialEnv, StepCounter, TransformedEnv
 
-import torchrl_etl.envs  # noqa: F401 registers the analytic task
-from tests.point_env import ACTION_DIM, PointEnv, move
-from tests.transform_checks import TransformChecks
-from torchrl_etl.modules import SynergyDecoder
+from tests.latent_action_checks import D, LatentActionChecks, decode, fixed_decoder
+from tests.point_env import ACTION_DIM, PointEnv
 from torchrl_etl.transforms import SynergyAction
 
-D = 2
 
-
-def fixed_decoder(action_dim=ACTION_DIM, **kwargs):
-    """The same weights in every process."""
-    with torch.random.fork_rng():
-        torch.manual_seed(3)
-        return SynergyDecoder(D, action_dim, hidden=(8,), **kwargs)
-
-
-def decode(synergy, decoder=None):
-    decoder = decoder or fixed_decoder()
-    with torch.no_grad():
-        return decoder.module(synergy)
-
-
-class TestSynergyAction(TransformChecks):
-    synergy_key, decoded_key = "synergy", "action"
+class TestSynergyAction(LatentActionChecks):
+    latent_key = "synergy"
 
     @staticmethod
     def transform(nested=False):
@@ -64,99 +27,14 @@ class TestSynergyAction(TransformChecks):
             )
         return SynergyAction(fixed_decoder())
 
-    def check_values(self, rollout):
-        executed = rollout["next", "executed_action"]
-        torch.testing.assert_close(executed, decode(rollout[self.synergy_key]))
-        expected = move(rollout["observation"], executed)
-        torch.testing.assert_close(rollout["next", "observation"], expected)
-        # Root holds what was executed before, and zero at the start of each episode.
-        before = executed[..., :-1, :].where(~rollout["next", "done"][..., :-1, :], 0.0)
-        torch.testing.assert_close(rollout["executed_action"][..., 1:, :], before)
-        assert (executed.norm(dim=-1) > 0.1).all()
-        assert set(rollout["next"].keys()).isdisjoint({"action", "synergy", "decoded_action"})
-        private = [key for td in (rollout, rollout["next"]) for key in td.keys() if key[0] == "_"]
-        assert not private
-        if "collector" in rollout.keys():
-            assert torch.equal(rollout[self.decoded_key], executed)
-        assert not executed.requires_grad
-
-    def check_multi_step(self, moved, plain):
-        torch.testing.assert_close(moved[self.decoded_key], decode(moved[self.synergy_key]))
-
-    def test_the_callers_root_never_holds_the_decoded_action(self):
-        env = self.env()
-        state = env.reset()
-        assert state["executed_action"].tolist() == [0.0] * ACTION_DIM
-        state = env.rand_action(state)
-        synergy = state[self.synergy_key].clone()
-        state = env.step(state)
-        assert torch.equal(state[self.synergy_key], synergy)
-        assert ("action" in set(state.keys())) == (self.synergy_key == "action")
-
-    def test_action_spec_is_the_decoders(self):
-        for batch_size in [(), (3,)]:
-            env = self.env(batch_size=batch_size)
-            assert env.action_keys == [self.synergy_key]
-            spec = env.full_action_spec[self.synergy_key]
-            assert spec == fixed_decoder().synergy_spec.expand(*batch_size, D)
-            assert env.observation_spec["executed_action"] == env.base_env.action_spec
-
-    def test_no_env(self):
-        transform = self.transform()
-        with pytest.raises(RuntimeError, match="inverse pass of an env only"):
-            transform(TensorDict({self.synergy_key: torch.zeros(D)}))
-
-    def test_compose(self):
-        synergy = torch.linspace(-1, 1, 3 * D).view(3, D)
-        data = TensorDict({self.synergy_key: synergy}, [3])
-        decoded = Compose(self.transform(), StepCounter()).inv(data)
-        torch.testing.assert_close(decoded["action"], decode(synergy))
-
-    def test_model(self):
-        network = TensorDictModule(nn.Linear(3, D), ["observation"], [self.synergy_key])
-        data = TensorDict({"observation": torch.zeros(3)})
-        for model in (
-            nn.Sequential(network, self.transform()),
-            TensorDictSequential(network, self.transform()),
-        ):
-            with pytest.raises(RuntimeError, match="the module itself"):
-                model(data)
-
-    def test_replay_buffer(self):
-        refused = partial(pytest.raises, TypeError, match="cannot be attached to a replay buffer")
-        storage = partial(LazyTensorStorage, 4)
-        with refused():
-            ReplayBuffer(storage=storage(), transform=self.transform())
-        with refused():
-            TensorDictReplayBuffer(storage=storage(), transform=Compose(self.transform()))
-        # TorchRL calls a factory at the buffer's first use.
-        buffer = TensorDictReplayBuffer(storage=storage(), transform_factory=self.transform)
-        with refused():
-            buffer.extend(TensorDict({self.synergy_key: torch.zeros(4, D)}, [4]))
-        buffer = TensorDictReplayBuffer(storage=storage())
-        with refused():
-            buffer.append_transform(self.transform())
-        with refused():
-            buffer.insert_transform(0, self.transform())
-        with refused():
-            buffer.append_transform(Compose(StepCounter(), self.transform()))
-        buffer.append_transform(StepCounter())
-
-    def test_inverse(self):
-        synergy = torch.full((3, D), 0.5, requires_grad=True)
-        data = TensorDict({self.synergy_key: synergy}, [3])
-        decoded = self.transform().inv(data)["action"]
-        torch.testing.assert_close(decoded, decode(synergy))
-        assert not decoded.requires_grad
-        assert data[self.synergy_key] is synergy, "the input is left alone"
-        with pytest.raises(KeyError, match="let the policy write it"):
-            self.transform().inv(TensorDict())
+    # Collectors in other processes start slowly; those of LatentAction run it too.
+    test_two_collector_workers_collect = None
 
 
-class TestSynergyActionUnderTheActionKey(TestSynergyAction):
+class TestSynergyActionUnderTheActionKey(LatentActionChecks):
     """For policies that write ``action`` and nothing else."""
 
-    synergy_key, decoded_key = "action", "decoded_action"
+    latent_key, decoded_key = "action", "decoded_action"
 
     @staticmethod
     def transform(nested=False):
@@ -172,7 +50,7 @@ class TestSynergyActionUnderTheActionKey(TestSynergyAction):
     def test_action_spec_is_one_leaf(self):
         assert self.env().action_spec == fixed_decoder().synergy_spec
 
-    # Workers of this layout start slowly and would tell nothing beyond the parent class.
+    # They start slowly and would tell nothing beyond those of LatentAction.
     test_two_collector_workers_collect = None
 
 
@@ -246,115 +124,6 @@ def test_native_autoreset_returns_only_the_reset_env_to_rest():
     assert torch.equal(after["executed_action"][[0, 2]], before[[0, 2]])
 
 
-def collect(env, **kwargs):
-    """A batch of 12 frames of TorchRL's collector."""
-    collector = Collector(env, None, frames_per_batch=12, total_frames=12, **kwargs)
-    (batch,) = collector
-    collector.shutdown()
-    return batch
-
-
-def pairs(batch, decoder=None):
-    """Asserts that root synergy and root action belong together."""
-    torch.testing.assert_close(batch["action"], decode(batch["synergy"], decoder))
-
-
-@pytest.mark.parametrize(
-    "kwargs",
-    [{}, {"device": "cpu"}, {"storing_device": "cpu"}, {"use_buffers": False}],
-    ids=str,
-)
-@pytest.mark.parametrize("layout", ["single", "batched", "around serial", "no device", "appended"])
-def test_collected_pairs_are_together_at_the_root(layout, kwargs):
-    env = {
-        "single": PointEnv,
-        "batched": partial(PointEnv, (3,)),
-        "around serial": partial(SerialEnv, 2, PointEnv),
-        "no device": partial(GymEnv, "torchrl_etl/Overactuated-v0", device=None),
-        "appended": partial(TransformedEnv, PointEnv(), StepCounter()),
-    }[layout]()
-    decoder = fixed_decoder(16 if layout == "no device" else ACTION_DIM)
-    env = TransformedEnv(env, SynergyAction(decoder))
-    for steps in (1, 3):  # a collector does not change what rollouts and resets are
-        env.rollout(steps)
-    pairs(collect(env, **kwargs), decoder)
-
-
-def keep_at_root():
-    return RenameTransform([("next", "executed_action")], ["action"], create_copy=True)
-
-
-def test_multi_step_leaves_pairs_together():
-    make = partial(TransformedEnv, PointEnv(), SynergyAction(fixed_decoder()))
-    pairs(collect(make(), postproc=MultiStep(0.9, 3)))
-
-
-def test_multi_step_leaves_pairs_of_workers_together_behind_a_rename():
-    def transformed():
-        return TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
-
-    batch = collect(
-        SerialEnv(2, transformed), postproc=nn.Sequential(keep_at_root(), MultiStep(0.9, 3))
-    )
-    pairs(batch)
-
-
-@pytest.mark.parametrize("collected", [True, False])
-def test_multi_step_transform_of_a_buffer_leaves_pairs_together(collected):
-    env = TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
-    batch = (
-        collect(env) if collected else keep_at_root()(env.rollout(12, break_when_any_done=False))
-    )
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(20), transform=MultiStepTransform(3, 0.9), batch_size=8
-    )
-    buffer.extend(batch)
-    pairs(buffer.sample())
-    moved = buffer[:]["next", "executed_action"] - decode(buffer[:]["synergy"])
-    assert moved.abs().max() > 1e-3
-
-
-class _Clip(Transform):
-    """Halves the range that the simulator gets, as an inner safety clip would."""
-
-    def __init__(self) -> None:
-        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
-
-    def _inv_apply_transform(self, action):
-        return action.clamp(-0.5, 0.5)
-
-
-def test_executed_action_behind_a_scaling_is_what_ran_and_root_action_what_was_decoded():
-    env = TransformedEnv(
-        PointEnv(low=0.0, high=1.0), Compose(ActionScaling(), SynergyAction(fixed_decoder()))
-    )
-    check_env_specs(env)
-    rollout = collect(env)
-    decoded, executed = rollout["action"], rollout["next", "executed_action"]
-    torch.testing.assert_close(decoded, decode(rollout["synergy"]))
-    torch.testing.assert_close(executed, (decoded + 1) / 2)
-    expected = move(rollout["observation"], executed)
-    torch.testing.assert_close(rollout["next", "observation"], expected)
-    assert env.observation_spec["executed_action"] == env.base_env.action_spec
-    assert rollout["executed_action"][0].eq(0).all()
-
-
-def test_executed_action_behind_a_clip_is_clipped():
-    decoder = fixed_decoder()
-    with torch.no_grad():
-        decoder.module.scale.fill_(20.0)
-    env = TransformedEnv(PointEnv(), Compose(_Clip(), SynergyAction(decoder)))
-    rollout = collect(env)
-    assert rollout["action"].abs().max() > 0.6
-    assert torch.equal(rollout["next", "executed_action"], rollout["action"].clamp(-0.5, 0.5))
-
-
-def test_scaling_in_an_inner_environment_is_warned_of():
-    inner = TransformedEnv(PointEnv(low=0.0, high=1.0), ActionScaling())
-    with pytest.warns(UserWarning, match="append SynergyAction to that environment"):
-        TransformedEnv(inner, SynergyAction(fixed_decoder()), auto_unwrap=False)
-
-
 def test_repr_says_what_decodes_into_what():
     shown = repr(SynergyAction(fixed_decoder()))
     assert "SynergyDecoder of 2 numbers into 5 actuators in [-1, 1]" in shown
@@ -367,18 +136,6 @@ def test_an_env_that_is_not_batch_locked_takes_any_batch():
     state = env.reset(start, set_state=True).set("synergy", torch.zeros(4, D))
     assert state["executed_action"].shape == (4, 1)
     assert env.step(state)["next", "executed_action"].shape == (4, 1)
-
-
-def test_works_on_a_real_env():
-    env = TransformedEnv(GymEnv("Pendulum-v1"), SynergyAction(fixed_decoder(1, low=-2.0, high=2.0)))
-    env.set_seed(0)
-    rollout = env.rollout(3)
-    twin = GymEnv("Pendulum-v1")
-    twin.set_seed(0)
-    state = twin.reset()
-    for step in rollout:
-        state = twin.step(state.set("action", step["next", "executed_action"]))["next"]
-        torch.testing.assert_close(state["observation"], step["next", "observation"])
 
 
 def attach(env, transform):

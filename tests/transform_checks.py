@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -57,6 +58,11 @@ class TransformChecks(ABC):
     @classmethod
     def env(cls, *, nested: bool = False, batch_size: tuple[int, ...] = ()) -> EnvBase:
         return TransformedEnv(PointEnv(batch_size, nested), cls.transform(nested))
+
+    @classmethod
+    def worker_envs(cls) -> list[Callable[[], EnvBase]]:
+        """What the workers of a collector step, with the same keys and values."""
+        return [cls.env] * WORKERS
 
     # Layouts
 
@@ -150,7 +156,7 @@ class TransformChecks(ABC):
     @pytest.mark.slow
     def test_two_collector_workers_collect(self):
         collector = MultiSyncCollector(
-            [self.env] * WORKERS, frames_per_batch=12, total_frames=24, cat_results="stack"
+            self.worker_envs(), frames_per_batch=12, total_frames=24, cat_results="stack"
         )
         try:
             collector.set_seed(0)
