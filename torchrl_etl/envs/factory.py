@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -16,6 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
 from torchrl_etl.envs.action_space import FlatAction, check_action_space
+from torchrl_etl.envs.arguments import argument_errors, check_known
 from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
 from torchrl_etl.envs.simulator import simulator
@@ -125,7 +125,7 @@ def make_env(
         action_repeat=action_repeat,
         env_kwargs=dict(env_kwargs or {}),
     )
-    with quiet_compiler(), _argument_errors(task, env_kwargs):
+    with quiet_compiler(), argument_errors(task.name, env_kwargs or {}):
         build = partial(build, success_key=success_key or _success_key(task, env_kwargs))
         if num_envs == 1:
             env = GymWrapper(build(), device=device)
@@ -176,20 +176,6 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
     if all(name.endswith("_r") for name in names):
         return [name.removesuffix("_r") for name in names]
     return names
-
-
-@contextmanager
-def _argument_errors(task: Task, env_kwargs: Mapping[str, Any] | None) -> Iterator[None]:
-    """Name the task and the arguments where a simulator says "unexpected keyword" alone."""
-    try:
-        yield
-    except TypeError as error:
-        if not env_kwargs:
-            raise
-        raise ValueError(
-            f"{task.name} does not take env_kwargs={dict(env_kwargs)} ({error}); use names and "
-            "types that its own constructor knows."
-        ) from error
 
 
 class _BatchedGymWrapper(GymWrapper):
@@ -260,6 +246,8 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
         # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
         env, faults = gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
     try:
+        if task.suite != "dm_control":  # which refuses them itself
+            check_known(env, task.name, env_kwargs)
         check_action_space(env.action_space, task.name)
     except ValueError:
         env.close()

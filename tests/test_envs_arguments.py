@@ -1,0 +1,52 @@
+"""``env_kwargs``: arguments that a simulator ignores are refused, those that it reads are not."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from torchrl_etl.envs import make_env
+
+
+class Forgiving(gym.Env):
+    """Takes any argument, reads one by its name in the signature and one out of the rest."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, stiffness=1.0, **kwargs):
+        self.stiffness, self.recipe = stiffness, kwargs.pop("recipe", None)
+
+    def reset(self, *, seed=None, options=None):
+        return np.full(1, self.stiffness, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, True, False, {}
+
+
+gym.register("torchrl_etl_test/Forgiving-v0", entry_point=Forgiving, max_episode_steps=2)
+FORGIVING = "torchrl_etl_test/Forgiving-v0"
+
+
+def test_arguments_that_a_constructor_names_or_looks_up_reach_it():
+    env = make_env(FORGIVING, env_kwargs={"stiffness": 0.5, "recipe": "a"})
+    assert env.reset()["observation"].item() == 0.5
+
+
+def test_an_argument_of_gymnasium_s_own_reaches_it():
+    assert make_env(FORGIVING, env_kwargs={"max_episode_steps": 7}).reset() is not None
+
+
+def test_an_argument_that_is_ignored_is_refused_with_the_nearest_known():
+    with pytest.raises(ValueError, match=r"ignores env_kwargs\.stifness.*they know stiffness"):
+        make_env(FORGIVING, env_kwargs={"stifness": 0.5})
+
+
+def test_myosuite_s_own_arguments_reach_it_and_others_are_refused():
+    make_env("myoHandKeyTurn", env_kwargs={"frame_skip": 5, "goal_th": 1.0}).close()
+    with pytest.raises(ValueError, match=r"myoHandKeyTurn ignores env_kwargs\.nonsense"):
+        make_env("myoHandKeyTurn", env_kwargs={"nonsense": 3})
+
+
+def test_dm_control_refuses_by_itself():
+    with pytest.raises(ValueError, match="does not take env_kwargs"):
+        make_env("cartpole-swingup", env_kwargs={"nonsense": 3})

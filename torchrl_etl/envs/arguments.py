@@ -1,0 +1,51 @@
+"""Arguments of a simulator that it does not know, in one sentence."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+
+__all__ = ["argument_errors", "check_known"]
+
+
+@contextmanager
+def argument_errors(name: str, env_kwargs: Mapping[str, Any]) -> Iterator[None]:
+    """Name the task and the arguments where a simulator says "unexpected keyword" alone."""
+    try:
+        yield
+    except TypeError as error:
+        if not env_kwargs:
+            raise
+        raise ValueError(
+            f"{name} does not take env_kwargs={dict(env_kwargs)} ({error}); use names and types "
+            "that its own constructor knows."
+        ) from error
+
+
+def check_known(env: gym.Env, name: str, env_kwargs: Mapping[str, Any]) -> None:
+    """Refuse arguments that the constructors of an environment take and ignore.
+
+    MyoSuite's end in ``**kwargs`` that nobody reads. An argument is known if a constructor has it
+    as a parameter, or its code names it (``kwargs.pop("model_recipe", None)``).
+
+    Raises:
+        ValueError: naming the argument and the nearest known ones.
+    """
+    constructors = [vars(base).get("__init__") for base in type(env.unwrapped).__mro__]
+    known, named = set(inspect.signature(gym.make).parameters), set()
+    for constructor in filter(inspect.isfunction, constructors):
+        known |= inspect.signature(constructor).parameters.keys()
+        named |= {const for const in constructor.__code__.co_consts if isinstance(const, str)}
+    known -= {"self", "kwargs"}
+    for key in env_kwargs:
+        if key not in known | named:
+            near = difflib.get_close_matches(key, known) or sorted(known)
+            raise ValueError(
+                f"{name} ignores env_kwargs.{key}, since no constructor of its simulator reads it; "
+                f"they know {', '.join(near)}."
+            )
