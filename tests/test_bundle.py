@@ -113,10 +113,11 @@ def widen(folder):
 
 DAMAGE = {
     "SHA-256": flip_a_byte,
-    "safetensors in .* cannot be read": lambda f: (f / "synergies.safetensors").unlink(),
-    "json in .* cannot be read": lambda f: (f / "synergies.json").unlink(),
+    r"safetensors cannot be read \(No such file": lambda f: (f / "synergies.safetensors").unlink(),
+    r"synergies\.json cannot be read \(No such file": lambda f: (f / "synergies.json").unlink(),
     "is not JSON": lambda f: (f / "synergies.json").write_text("{"),
-    "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("[1]"),
+    r"synergies\.json holds no JSON object": lambda f: (f / "synergies.json").write_text("[1]"),
+    "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("{}"),
     "format version 3 and this torchrl_etl reads 1 and 2": lambda f: edit(f, format_version=3),
     r"lacks \['task'\]": lambda f: edit(f, task=None),
     r"the unknown \['surprise'\]": lambda f: edit(f, surprise=1),

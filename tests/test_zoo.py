@@ -210,7 +210,7 @@ def swap_weights(entry, value=0.0):
         (lambda entry: cut(entry / "policy.safetensors"), "SHA-256 is not the one in card.json"),
         (lambda entry: (entry / "policy.safetensors").unlink(), "cannot be read"),
         (lambda entry: cut(entry / "card.json"), "is not JSON"),
-        (lambda entry: (entry / "card.json").write_text("[]"), "format_version None"),
+        (lambda entry: (entry / "card.json").write_text("[]"), "holds no JSON object"),
         (lambda entry: rewrite(entry, format_version=9), "format_version 9"),
         (lambda entry: rewrite(entry, policy=[]), "not what belongs to 'policy'"),
         (lambda entry: rewrite(entry, more=1), "not what belongs to 'more'"),

@@ -1,4 +1,7 @@
-"""Replace files so that a crash leaves the old ones or the new ones, never a mixture."""
+"""Read and replace files: what is wrong with one is one sentence, and a crash leaves no mixture.
+
+A crash in the middle of a replacement leaves the old files or the new ones.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,57 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 __all__ = [
     "as_json",
     "flush_folder",
+    "read_bytes",
+    "read_json",
     "replace_folder",
     "require_room",
     "reserve",
     "surviving_folder",
     "write_atomically",
 ]
+
+Content = TypeVar("Content", dict[str, Any], list[Any])
+
+
+def read_bytes(path: Path, error: type[Exception], cure: str) -> bytes:
+    """The content of a file.
+
+    Args:
+        path (Path): the file.
+        error (type of exception): what to raise if there is none, or it cannot be read.
+        cure (str): the end of its sentence: what helps.
+
+    Examples:
+        >>> read_bytes(Path("card.json"), ValueError, "copy it again")
+        Traceback (most recent call last):
+        ...
+        ValueError: card.json cannot be read (No such file or directory); copy it again.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as fault:
+        raise error(f"{path} cannot be read ({fault.strerror}); {cure}.") from fault
+
+
+def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str) -> Content:
+    """The object (``dict``) or array (``list``) that a JSON file holds.
+
+    The arguments besides ``kind`` are those of :func:`read_bytes`; a file that is not JSON, or
+    holds anything else, raises the same ``error``.
+    """
+    text = read_bytes(path, error, cure)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as fault:
+        raise error(f"{path} is not JSON ({fault}); {cure}.") from fault
+    if not isinstance(content, kind):
+        raise error(f"{path} holds no JSON {'array' if kind is list else 'object'}; {cure}.")
+    return content
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:

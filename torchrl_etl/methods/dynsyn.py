@@ -15,7 +15,7 @@ from torchrl_etl.baselines import (
     record_muscle_lengths,
     set_frames,
 )
-from torchrl_etl.io import write_atomically
+from torchrl_etl.io import read_json, write_atomically
 from torchrl_etl.learners import entropy_target
 from torchrl_etl.methods.method import Method
 from torchrl_etl.training.context import Context
@@ -69,7 +69,8 @@ class DynSyn(Method):
     @property
     def groups(self) -> list[int]:
         if self.file.is_file():
-            return json.loads(self.file.read_text(encoding="utf-8"))
+            cure = "move it away, and the muscles are grouped again"
+            return read_json(self.file, list, OSError, cure)
         return list(range(len(self.context.spec.actuators)))  # a placeholder
 
     def actor(self) -> dict[str, Any]:

@@ -23,9 +23,10 @@ from safetensors import SafetensorError
 from tensordict.utils import NestedKey
 
 from torchrl_etl.checks import not_finite
-from torchrl_etl.io import replace_folder, surviving_folder
+from torchrl_etl.io import read_bytes, replace_folder, surviving_folder
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies.bundle_info import (
+    COPY_AGAIN,
     DESCRIPTION,
     BundleError,
     BundleInfo,
@@ -174,13 +175,7 @@ def load_bundle(
     """
     folder = _find_folder(Path(path))
     info = read_description(folder)
-    try:
-        content = (folder / _TENSORS).read_bytes()
-    except OSError as error:
-        raise BundleError(
-            f"{_TENSORS} in {str(folder)!r} cannot be read ({error.strerror}); copy the bundle "
-            "again, with both its files."
-        ) from error
+    content = read_bytes(folder / _TENSORS, BundleError, COPY_AGAIN)
     if hashlib.sha256(content).hexdigest() != info.sha256:
         raise BundleError(
             f"{_TENSORS} in {str(folder)!r} is damaged or belongs to another bundle: its SHA-256 "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
@@ -12,7 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_etl.io import read_json
+
 __all__ = [
+    "COPY_AGAIN",
     "DESCRIPTION",
     "FORMAT_VERSION",
     "BundleError",
@@ -24,6 +26,7 @@ __all__ = [
 ]
 
 DESCRIPTION = "synergies.json"
+COPY_AGAIN = "copy the bundle again, with both its files"
 FORMAT_VERSION = 2  # 1 had neither kind nor encoder
 
 
@@ -71,21 +74,14 @@ def read_description(folder: Path) -> BundleInfo:
     Raises:
         BundleError: if it cannot be read, is damaged, or has another format version.
     """
-    name = f"{DESCRIPTION} in {str(folder)!r}"
-    try:
-        content = json.loads((folder / DESCRIPTION).read_bytes())
-    except OSError as error:
-        raise BundleError(
-            f"{name} cannot be read ({error.strerror}); copy the bundle again, with both its files."
-        ) from error
-    except ValueError as error:
-        raise BundleError(f"{name} is not JSON ({error}); copy the bundle again.") from error
-    version = content.get("format_version") if isinstance(content, dict) else None
+    path = folder / DESCRIPTION
+    content = read_json(path, dict, BundleError, COPY_AGAIN)
+    version = content.get("format_version")
     if version is None:
-        raise BundleError(f"{name} has no format_version: it does not describe a synergy bundle.")
+        raise BundleError(f"{path} has no format_version: it does not describe a synergy bundle.")
     if version not in (1, FORMAT_VERSION):
         raise BundleError(
-            f"{name} has format version {version!r} and this torchrl_etl reads 1 and "
+            f"{path} has format version {version!r} and this torchrl_etl reads 1 and "
             f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
         )
     known = {item.name for item in fields(BundleInfo)}
@@ -94,21 +90,21 @@ def read_description(folder: Path) -> BundleInfo:
     if set(content) != known:
         missing, extra = sorted(known - set(content)), sorted(set(content) - known)
         raise BundleError(
-            f"{name} lacks {missing} and has the unknown {extra}; it was edited, so copy the "
+            f"{path} lacks {missing} and has the unknown {extra}; it was edited, so copy the "
             "bundle again."
         )
     kinds = {"actuators": list, "low": list, "high": list, "config": dict, "facts": dict}
     for key, kind in kinds.items():
         if not isinstance(content[key], kind):
             raise BundleError(
-                f"{name} has {content[key]!r} as {key} where a JSON "
+                f"{path} has {content[key]!r} as {key} where a JSON "
                 f"{'array' if kind is list else 'object'} belongs; copy the bundle again."
             )
     if version == 1:
         content["kind"] = default_kind(not content["config"].get("hidden", True))
     if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
         raise BundleError(
-            f"{name} has {content['kind']!r} as kind, which must be a text, and "
+            f"{path} has {content['kind']!r} as kind, which must be a text, and "
             f"{content['encoder']!r} as encoder, an object or null; copy the bundle again."
         )
     content |= {key: tuple(content[key]) for key in ("actuators", "low", "high")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import json
 import os
 import platform
 import subprocess
@@ -19,7 +18,7 @@ from filelock import FileLock, Timeout
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.extras import extra
-from torchrl_etl.io import as_json, write_atomically
+from torchrl_etl.io import as_json, read_json, write_atomically
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -188,13 +187,9 @@ class RunFolder:
     def _read_json(self, name: str, default: Any) -> Any:
         """What :meth:`write_json` wrote; a value of the same type as ``default``, if none."""
         path = self.path / name
-        try:
-            content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else default
-        except ValueError:
-            content = None
-        if not isinstance(content, type(default)):
-            raise OSError(f"{path} is damaged; move it away to go on without it.")
-        return content
+        if not path.exists():
+            return default
+        return read_json(path, type(default), OSError, "move it away to go on without it")
 
 
 def _claimed(path: Path) -> Path:

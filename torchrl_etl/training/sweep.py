@@ -106,9 +106,9 @@ class Run:
     def rows(self, status: str) -> Iterator[dict[str, Any]]:
         """Its evaluations, oldest first."""
         folder = self.folder
-        if folder is None or not (self.path / "versions.json").is_file():
+        if folder is None or not folder.versions:
             return
-        facts = json.loads((self.path / "versions.json").read_text(encoding="utf-8"))[-1]
+        facts = folder.versions[-1]
         own = {"commit": facts.pop("commit"), "machine": facts.pop("machine")}
         own |= {"versions": json.dumps(facts), "status": status}
         own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}

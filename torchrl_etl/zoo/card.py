@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from torchrl_etl.io import as_json
+from torchrl_etl.io import as_json, read_json
 
 __all__ = ["CARD", "WEIGHTS", "Card", "ZooError"]
 
@@ -60,15 +59,8 @@ class Card:
             ZooError: if there is none that this release understands.
         """
         path = folder / CARD
-        try:
-            content = json.loads(path.read_bytes())
-        except OSError as error:
-            raise ZooError(
-                f"{path} cannot be read ({error.strerror}); copy the entry again."
-            ) from error
-        except ValueError as error:
-            raise ZooError(f"{path} is not JSON ({error}); copy the entry again.") from error
-        version = content.get("format_version") if isinstance(content, dict) else None
+        content = read_json(path, dict, ZooError, "copy the entry again")
+        version = content.get("format_version")
         if version != FORMAT_VERSION:
             raise ZooError(
                 f"{path} has format_version {version!r} where this torchrl_etl reads "

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env
-from torchrl_etl.io import replace_folder
+from torchrl_etl.io import read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
@@ -216,12 +216,7 @@ def _holds_bundle(folder: Path) -> bool:
 
 def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
     path = folder / WEIGHTS
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ZooError(
-            f"{path} cannot be read ({error.strerror}); copy the entry again."
-        ) from error
+    content = read_bytes(path, ZooError, "copy the entry again")
     if hashlib.sha256(content).hexdigest() != card.sha256:
         raise ZooError(
             f"{path} is damaged or belongs to another entry: its SHA-256 is not the one in {CARD}; "
