@@ -19,8 +19,9 @@ from torchrl_etl.envs import make_env
 from torchrl_etl.modules import SynergyDecoder, make_actor
 from torchrl_etl.training import Stage, alone
 from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.work import Work
 
-__all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy", "train"]
+__all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy", "train", "training"]
 
 CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
@@ -46,11 +47,16 @@ def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
     return TensorDictSequential(actor, decoder)
 
 
-def train(stage: Stage, updates: int, at_once: int) -> None:
+def training(stage: Stage, updates: int, at_once: int) -> Work[None]:
     """So many updates by the way that training takes, as if frames had earned ``at_once`` each."""
     for _ in range(max(1, updates // at_once)):
         stage.progress.owed += at_once
-        alone(stage.learn())
+        yield from stage.learn()
+
+
+def train(stage: Stage, updates: int, at_once: int) -> None:
+    """Do the work of :func:`training`."""
+    alone(training(stage, updates, at_once))
 
 
 class Child:

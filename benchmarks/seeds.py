@@ -4,8 +4,9 @@
     python benchmarks/seeds.py --seeds 8 --compile
 
 One thread and CPU time; both take turns in blocks of updates. ``explore`` and ``learn`` are the
-whole updates of the recipe's stages, sampling included, random numbers of each seed included. A
-ratio is to the same seeds one after another.
+recipe's stages, which make their updates as in training, 16 earned at a time: sampling, each seed's
+random numbers and its own state of the generators are included. A ratio is to the same seeds one
+after another.
 """
 
 from __future__ import annotations
@@ -16,17 +17,18 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is there
 
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
-from harness import interleave, line, recipe
-from update import transitions
+from harness import line, recipe, train, training
+from update import AT_ONCE, transitions
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.learners import SideBySide
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import Stage
+from torchrl_etl.training.together import together
+from torchrl_etl.training.work import Work
 
 
 def filled(seed: int, name: str, compile: bool, env: str) -> Stage:
@@ -35,8 +37,35 @@ def filled(seed: int, name: str, compile: bool, env: str) -> Stage:
     experiment = Experiment(recipe(*overrides, "run_dir=unused"))
     stage = Explorer(experiment.context).stage if name == "explore" else experiment.method.stage()
     spec, d = experiment.context.spec, experiment.config.num_synergies
-    stage.buffer.extend(transitions(spec.observation_dim, spec.action_dim, d))
+    stage.prefill(transitions(spec.observation_dim, spec.action_dim, d))
+    stage.progress.owed = 0.0
     return stage
+
+
+def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, list[float]]:
+    """Milliseconds an update of one seed, block by block; one unrecorded block comes first.
+
+    All blocks together are one call of ``together``, since it is what compiles. The work of the
+    first seed therefore looks at the clock, and has the seeds updated one after another meanwhile.
+    """
+    seconds: dict[str, list[float]] = {"one_by_one": [], "together": []}
+
+    def first() -> Work[None]:
+        for _ in range(repeats + 1):
+            start = time.process_time()
+            for stage in stages:
+                train(stage, block, at_once=AT_ONCE)
+            middle = time.process_time()
+            yield from training(stages[0], block, at_once=AT_ONCE)
+            seconds["one_by_one"].append(middle - start)
+            seconds["together"].append(time.process_time() - middle)
+
+    others = [training(stage, (repeats + 1) * block, at_once=AT_ONCE) for stage in stages[1:]]
+    for result in together([first(), *others]):
+        if isinstance(result, BaseException):
+            raise result
+    updates = block * len(stages)
+    return {name: [1e3 * each / updates for each in values[1:]] for name, values in seconds.items()}
 
 
 def main() -> None:
@@ -44,46 +73,24 @@ def main() -> None:
     parser.add_argument("--env", default="myoHandKeyTurn")
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--block", type=int, default=10, help="updates measured at a time")
+    parser.add_argument(
+        "--block", type=int, default=1, help=f"how often {AT_ONCE} updates are measured at a time"
+    )
     parser.add_argument("--compile", action="store_true")
     arguments = parser.parse_args()
     quiet_torchrl()
     torch.set_num_threads(1)
 
-    def timed(update: Callable[[], object]) -> Callable[[], float]:
-        def block() -> float:
-            start = time.process_time()
-            for _ in range(arguments.block):
-                update()
-            seconds = time.process_time() - start
-            return 1e3 * seconds / (arguments.block * arguments.seeds)
-
-        return block
-
-    cases: dict[str, Callable[[], float]] = {}
+    more = {"seeds": arguments.seeds, "compile": arguments.compile}
     for name in ("explore", "learn"):
         stages = [
             filled(seed, name, arguments.compile, arguments.env) for seed in range(arguments.seeds)
         ]
-        group = SideBySide([stage.learner for stage in stages])
-
-        def together(stages: list[Stage] = stages, group: SideBySide = group) -> None:
-            batches = [stage.sample() for stage in stages]
-            group.update(batches, [group.draw(batch) for batch in batches])
-
-        def one_by_one(stages: list[Stage] = stages) -> None:
-            for stage in stages:
-                stage.update()
-
-        cases[f"together/{name}"] = timed(together)
-        cases[f"one_by_one/{name}"] = timed(one_by_one)
-    values = interleave(cases, arguments.repeats)
-    for name in ("explore", "learn"):
-        other = f"one_by_one/{name}"
-        more = {"seeds": arguments.seeds, "compile": arguments.compile}
-        line("seeds", other, "ms", values[other], **more)
-        mine = f"together/{name}"
-        line("seeds", mine, "ms", values[mine], peers={other: values[other]}, **more)
+        values = measured(stages, arguments.repeats, AT_ONCE * arguments.block)
+        other = values["one_by_one"]
+        line("seeds", f"one_by_one/{name}", "ms", other, **more)
+        peers = {f"one_by_one/{name}": other}
+        line("seeds", f"together/{name}", "ms", values["together"], peers=peers, **more)
 
 
 if __name__ == "__main__":

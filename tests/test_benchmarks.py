@@ -12,9 +12,10 @@ import pytest
 
 from tests.configs import ROOT
 from tests.stages import fill, method_stage
+from torchrl_etl.learners import SideBySide
 
 FOLDER = ROOT / "benchmarks"
-NAMES = ("bench", "end_to_end", "floor", "harness", "machine", "peers")
+NAMES = ("bench", "end_to_end", "floor", "harness", "machine", "peers", "seeds", "update")
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +23,7 @@ def benchmarks() -> Iterator[SimpleNamespace]:
     """Its modules, imported as its scripts import them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(FOLDER)
+        patch.setenv("OMP_NUM_THREADS", "1")  # as some of them set it for good
         modules = {name: __import__(name) for name in NAMES}
         yield SimpleNamespace(**modules)
         for name in modules:
@@ -90,6 +92,27 @@ def test_updates_are_timed_as_training_makes_them(benchmarks):
     benchmarks.harness.train(stage, 4, at_once=2)
     stage.close()
     assert stage.progress.updates == 4 and stage.progress.owed == 0
+
+
+def test_seeds_are_timed_as_training_updates_them_together(benchmarks, monkeypatch):
+    calls, updates = [], SideBySide.updates
+    monkeypatch.setattr(benchmarks.seeds, "AT_ONCE", 2)
+    monkeypatch.setattr(
+        SideBySide,
+        "updates",
+        lambda self, batches, draws: calls.append(len(batches[0])) or updates(self, batches, draws),
+    )
+    stages = [method_stage("sac", f"seed={seed}") for seed in (0, 1)]
+    for stage in stages:
+        fill(stage, 1)
+        stage.progress.owed = 0.0
+    values = benchmarks.seeds.measured(stages, repeats=1, block=4)
+    for stage in stages:
+        stage.close()
+        assert stage.progress.updates == 2 * (4 + 4)  # a block before the one that is recorded
+    assert calls == [2, 2] * 2
+    assert [len(each) for each in values.values()] == [1, 1]
+    assert min(values["together"] + values["one_by_one"]) > 0
 
 
 def test_a_python_without_peers_is_told_what_installs_them(benchmarks, tmp_path):
