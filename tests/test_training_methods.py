@@ -21,8 +21,9 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.sar import finished_episodes, rollouts
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
-from torchrl_etl.training import resumed_config
+from torchrl_etl.training import alone, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.loop import StopOnSignal
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
@@ -234,7 +235,13 @@ def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
 def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     experiment = Experiment(config("dynsyn", tmp_path / "run"))
     groups = experiment.run()["groups"]
-    assert groups == json.loads((tmp_path / "run" / "muscle_groups.json").read_text())
+    file = tmp_path / "run" / "muscle_groups.json"
+    assert groups == json.loads(file.read_text())
+    file.write_text("[0, 1")
+    with pytest.raises(OSError, match=r"muscle_groups\.json is not JSON .*; move it away, and the"):
+        experiment.method.stage()
+    file.unlink()
+    assert alone(experiment.method.prepare(StopOnSignal())) == {"groups": groups}
     stage = experiment.learned()
     observation = torch.randn(50, experiment.context.spec.observation_dim)
     action = stage.learner.actor(TensorDict({"observation": observation}, [50]))["action"]
