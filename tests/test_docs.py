@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_etl import zoo
+from torchrl_etl.envs import list_tasks, resolve_task
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -70,3 +73,39 @@ def test_relative_links_point_at_something(page):
         if not path.exists() or (anchor and path.suffix == ".md" and anchor not in anchors(path)):
             broken.append(link)
     assert not broken
+
+
+@pytest.fixture(scope="module")
+def tasks_page() -> str:
+    return (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def cards(tasks_page) -> list[str]:
+    gallery = tasks_page.partition("## Gallery\n")[2].partition("\n## ")[0]
+    return gallery.split("\n-   ")[1:]
+
+
+@pytest.mark.parametrize("task", list_tasks(), ids=lambda task: task.name)
+def test_the_gallery_has_a_clip_the_actuators_and_the_command_of_a_task(task, cards, tasks_page):
+    (card,) = (card for card in cards if f"**{task.name}**" in card)
+    actuators = re.search(rf"^\| {task.name} \| `[^`]+` \| (\d+) \|", tasks_page, re.MULTILINE)[1]
+    assert f"](pictures/tasks/{task.name}.webp)" in card
+    assert f"**{task.name}**, {actuators} " in card
+    assert f"    python recipes/etl_sac.py env={task.name}\n" in card
+
+
+def test_the_gallery_shows_each_trained_policy_of_the_zoo_that_has_a_body(cards):
+    drawn = [
+        n for n in zoo.names() if resolve_task(zoo.read_card(n).task["name"]).suite != "gymnasium"
+    ]
+    for name in drawn:
+        (card,) = (card for card in cards if f"](pictures/tasks/{name}-trained.webp)" in card)
+        assert "](zoo.md)" in card and f"zoo={name}\n" in card
+
+
+def test_the_clips_of_the_gallery_are_small(cards):
+    clips = list((ROOT / "docs" / "pictures" / "tasks").iterdir())
+    sizes = {clip.name: clip.stat().st_size for clip in clips}
+    assert sorted(sizes) == sorted(re.findall(r"tasks/([\w-]+\.webp)", "".join(cards)))
+    assert max(sizes.values()) <= 80_000 and sum(sizes.values()) <= 1_000_000

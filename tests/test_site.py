@@ -28,6 +28,7 @@ PHONE = {"width": 390, "height": 844}
 PAGES = (
     "",
     "tutorials/explore/",
+    "tasks/",
     "architecture/",
     "faithfulness/",
     "results/",
@@ -95,6 +96,9 @@ def test_the_site_builds_strictly_and_shows_every_public_name(site):
     compose = (site / "compose" / "index.html").read_text(encoding="utf-8")
     assert "transforms/#torchrl_etl.transforms.SynergyAction" in compose
     assert 'class="admonition deviates"' in transforms
+    tasks = (site / "tasks" / "index.html").read_text(encoding="utf-8")
+    assert '<div class="grid cards gallery">' in tasks
+    assert tasks.count('<img loading="lazy"') == tasks.count("<img ") == tasks.count(".webp")
 
 
 @pytest.mark.slow

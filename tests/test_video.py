@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from tests.commands import command
 from torchrl_etl import zoo
 from torchrl_etl.analysis.moving_pictures import side_by_side, write_moving_pictures
+from torchrl_etl.analysis.viewer.framing import middle_and_size
 from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
 from torchrl_etl.envs import make_env, mujoco_state
 from torchrl_etl.modules import SynergyMap
@@ -108,6 +109,45 @@ def test_the_camera_keeps_the_hand_in_the_middle_and_the_room_out(recorder, env)
     assert len(shown) and (bodies != 0).any()
     untouched = (model.geom_contype | model.geom_conaffinity) == 0
     assert not any(model.geom_bodyid[geom] == 0 and untouched[geom] for geom in shown)
+
+
+def test_the_camera_looks_where_its_azimuth_says(env, monkeypatch):
+    monkeypatch.setattr(mujoco, "Renderer", Blind)
+    with EpisodeRecorder(env, size=(16, 20), azimuth=90.0) as recorder:
+        recorder.draw()
+        ahead = recorder._renderer.scene.camera[0].forward
+    down = np.deg2rad(24)
+    np.testing.assert_allclose(ahead, [0.0, np.cos(down), -np.sin(down)], atol=1e-6)
+
+
+def test_all_that_is_drawn_of_a_body_is_framed_and_nothing_else():
+    # A body whose box stands on its origin, a large sphere of it that is not drawn, and a floor.
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="3 0 0"><freejoint/>
+        <geom type="box" pos="0 0 .5" size=".25 .1 .5"/><geom type="sphere" size="5" group="3"/>
+        </body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    turned = np.deg2rad(90) / 2
+    data.qpos[3:] = [np.cos(turned), 0, np.sin(turned), 0]  # about y: what was up is along x
+    mujoco.mj_forward(model, data)
+    middle, size = middle_and_size(model, data)
+    np.testing.assert_allclose(middle, [3.5, 0.0, 0.0], atol=1e-6)
+    assert size == pytest.approx(np.linalg.norm([1.0, 0.2, 0.5]))
+
+
+@pytest.mark.slow
+def test_stairs_are_there_before_the_renderer_takes_them_over(monkeypatch):
+    heights = []
+
+    class Terrain(Blind):
+        def __init__(self, model, height, width):
+            heights.append(model.hfield_data.max())
+            super().__init__(model, height, width)
+
+    monkeypatch.setattr(mujoco, "Renderer", Terrain)
+    EpisodeRecorder(make_env("myoLegStairTerrainWalk"), size=(16, 20))
+    assert heights[0] > 0.5
 
 
 def test_a_camera_that_is_not_there_is_answered_with_those_that_are(env):

@@ -66,6 +66,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return markdown if uri.startswith(("api/", "source/")) else link_names(markdown)
 
 
+def on_page_content(html: str, **_: Any) -> str:
+    """Pictures are fetched when they come near the screen."""
+    return html.replace("<img ", '<img loading="lazy" ')
+
+
 def link_names(markdown: str) -> str:
     """Leads from the public names that a page mentions to the reference."""
     known: dict[str, list[str]] = {}

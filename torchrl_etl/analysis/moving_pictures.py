@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -15,7 +15,14 @@ import numpy as np
 from torchrl_etl.extras import extra
 from torchrl_etl.io import write_atomically
 
-__all__ = ["CAPTION_HEIGHT", "FPS", "grid_shape", "side_by_side", "write_moving_pictures"]
+__all__ = [
+    "CAPTION_HEIGHT",
+    "FPS",
+    "animated_picture",
+    "grid_shape",
+    "side_by_side",
+    "write_moving_pictures",
+]
 
 FPS = 25
 """Pictures in a second of video."""
@@ -84,8 +91,7 @@ def write_moving_pictures(
     folder.mkdir(parents=True, exist_ok=True)
     video, picture = folder / f"{name}.mp4", folder / f"{name}.webp"
     _write_video(video, side_by_side(sides))
-    shown = islice(side_by_side(sides), 0, _SMALL_SECONDS * FPS, _EVERY)
-    write_atomically(picture, _animated(shown))
+    write_atomically(picture, animated_picture(side_by_side(sides)))
     return [video, picture]
 
 
@@ -100,11 +106,19 @@ def _write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
         os.replace(whole, path)
 
 
-def _animated(frames: Iterator[np.ndarray]) -> bytes:
+def animated_picture(frames: Iterable[np.ndarray], *, quality: int = 50) -> bytes:
+    """Each second frame of the first eight seconds, at most 640 pixels wide, as an endless WebP.
+
+    Args:
+        frames (iterable of arrays): [H, W, 3] of uint8, 25 to a second.
+
+    Keyword Args:
+        quality (int): from 0, the smallest, to 100. Default: 50.
+    """
     with extra("video"):
         from PIL import Image
     images = []
-    for frame in frames:
+    for frame in islice(frames, 0, _SMALL_SECONDS * FPS, _EVERY):
         image = Image.fromarray(frame)
         image.thumbnail((_SMALL_WIDTH, image.height))
         images.append(image)
@@ -116,7 +130,7 @@ def _animated(frames: Iterator[np.ndarray]) -> bytes:
         append_images=images[1:],
         duration=round(1000 * _EVERY / FPS),
         loop=0,
-        quality=50,
+        quality=quality,
         method=4,
     )
     return content.getvalue()

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_etl.analysis.moving_pictures import CAPTION_HEIGHT, FPS, grid_shape
-from torchrl_etl.analysis.viewer.framing import middle_and_size, planes, scenery
+from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, middle_and_size, planes, scenery
 from torchrl_etl.checks import check_integer
 from torchrl_etl.envs import has_free_root, mujoco_state
 from torchrl_etl.extras import extra
@@ -20,7 +20,6 @@ from torchrl_etl.training.evaluation import EVALUATION_SEED
 __all__ = ["EpisodeRecorder", "check_video_size"]
 
 _BACKDROP = [0.93, 0.94, 0.96, 1.0]
-_HIDDEN_GROUP = 5  # MuJoCo draws groups 0 to 2 unless it is told otherwise
 _MOST_PIXELS = 4096  # in either direction: what decoders of MP4 can be relied on to show
 
 
@@ -82,6 +81,8 @@ class EpisodeRecorder:
         size (tuple of int): height and width in pixels.
         camera (str, optional): a camera of the model, which sees the whole scene. Default: one that
             keeps the body in the middle and leaves out what stands around it for show.
+        azimuth (float): where that one looks, in degrees from the world's x towards its y.
+            Default: 132.
         seconds (float): simulated seconds after which an episode is cut. Default: 10.
 
     Raises:
@@ -95,9 +96,10 @@ class EpisodeRecorder:
         *,
         size: tuple[int, int] = (240, 320),
         camera: str | None = None,
+        azimuth: float = 132.0,
         seconds: float = 10.0,
     ) -> None:
-        self._env, self._seconds = env, seconds
+        self._env, self._seconds, self._azimuth = env, seconds, azimuth
         self._model, self._data = mujoco_state(env)
         model = self._model
         with extra("video"):
@@ -111,6 +113,8 @@ class EpisodeRecorder:
         # The default frame buffer of most models is smaller than a readable picture.
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
+        # Resets, and the renderer takes over a terrain as it is.
+        self._follows, self._framed = has_free_root(env), None
         try:
             self._renderer = mujoco.Renderer(model, *size)
         except Exception as error:  # the GL back ends share no base class
@@ -119,12 +123,11 @@ class EpisodeRecorder:
                 "(Debian: apt-get install libegl1, or libosmesa6 for software rendering) and set "
                 "MUJOCO_GL=egl or MUJOCO_GL=osmesa."
             ) from error
-        self._follows, self._framed = has_free_root(env), None
         for costly in ("SHADOW", "REFLECTION"):  # seconds a picture without a GPU
             self._renderer.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{costly}")] = 0
         if camera is None:
             around = scenery(model) | (planes(model) & (not self._follows))
-            model.geom_group[around] = _HIDDEN_GROUP
+            model.geom_group[around] = SHOWN_GROUPS  # the first that are not
             light = model.vis.headlight  # the room's lamps leave with the room
             light.active, light.ambient[:], light.diffuse[:] = 1, 0.4, 0.5
 
@@ -199,7 +202,8 @@ class EpisodeRecorder:
             return self._framed
         middle, size = middle_and_size(self._model, self._data)
         view = self._framed = mujoco.MjvCamera()
-        view.lookat, view.distance, view.azimuth, view.elevation = middle, 1.35 * size, 132.0, -24.0
+        view.lookat, view.distance = middle, 1.35 * size
+        view.azimuth, view.elevation = self._azimuth, -24.0
         return view
 
     def _tendons(self) -> list[Any]:

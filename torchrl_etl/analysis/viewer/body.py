@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_etl.analysis.viewer.framing import (
+    SHOWN_GROUPS,
     middle_and_size,
     moving_bodies,
     planes,
@@ -23,7 +24,6 @@ with extra("viewer"):
 
 __all__ = ["Body"]
 
-_SHOWN_GROUPS = 3  # MuJoCo's own viewer shows groups 0 to 2
 _SHAPES = {
     "tendons": trimesh.creation.cylinder(radius=1.0, height=1.0, sections=8),
     "joints": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
@@ -84,7 +84,7 @@ class Body:
         model, scene = self._model, self._server.scene
         flat = planes(model)
         opacity = _rgba(model, "geom")[:, 3]
-        shown = (model.geom_group < _SHOWN_GROUPS) & (opacity > 0) & ~scenery(model)
+        shown = (model.geom_group < SHOWN_GROUPS) & (opacity > 0) & ~scenery(model)
         for geom in np.flatnonzero(shown & flat):
             scene.add_grid(
                 f"/world/plane{geom}",
@@ -107,7 +107,7 @@ class Body:
 
     def _add_sites(self) -> Any:
         model, rgba = self._model, _rgba(self._model, "site")
-        shown = (model.site_group < _SHOWN_GROUPS) & (rgba[:, 3] > 0)
+        shown = (model.site_group < SHOWN_GROUPS) & (rgba[:, 3] > 0)
         for site in np.flatnonzero(shown).tolist():
             mesh = create_site_mesh(model, site)
             yield self._add_flat(f"/world/site{site}", mesh, rgba[site]), site

@@ -9,7 +9,10 @@ import numpy as np
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["middle_and_size", "moving_bodies", "planes", "scenery"]
+__all__ = ["SHOWN_GROUPS", "middle_and_size", "moving_bodies", "planes", "scenery"]
+
+SHOWN_GROUPS = 3
+"""MuJoCo draws groups 0 to 2 of geoms and sites, unless it is told otherwise."""
 
 
 def planes(model: mujoco.MjModel) -> np.ndarray:
@@ -32,7 +35,21 @@ def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 
 def middle_and_size(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Middle [3] of the moving bodies in the world, and how far apart they are, 0.1 or more."""
-    places = data.xpos[moving_bodies(model)]
+    """Middle [3] of the moving bodies in the world, and how far apart they are, 0.1 or more.
+
+    What is drawn of a body counts, not its origin alone: a torso of one piece has its head far off.
+    """
+    bodies = moving_bodies(model)
+    places = np.concatenate([data.xpos[bodies], _corners(model, data, bodies)])
     low, high = places.min(0), places.max(0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.1)
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, bodies: np.ndarray) -> np.ndarray:
+    """Corners [8 G, 3] of the boxes around what is drawn of bodies."""
+    geoms = np.isin(model.geom_bodyid, bodies) & (model.geom_group < SHOWN_GROUPS)
+    middle, half = np.split(model.geom_aabb[geoms], 2, axis=1)
+    signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T
+    boxes = middle[:, None] + signs * half[:, None]
+    turned = boxes @ data.geom_xmat[geoms].reshape(-1, 3, 3).swapaxes(1, 2)
+    return (data.geom_xpos[geoms, None] + turned).reshape(-1, 3)
