@@ -25,10 +25,11 @@ OPTIONS: dict[str, list[str]] = {
     "collection": [],
     "update": ["--compile", "--repeats", "5"],
     "end_to_end": [],
+    "start": [],
     "transforms": [],
     "memory": [],
 }
-WITH_PEERS = ("update", "end_to_end")
+WITH_PEERS = ("update", "end_to_end", "start")
 BEGIN, END = "<!-- table: make bench -->\n", "<!-- end of table -->\n"
 Row = dict[str, Any]
 

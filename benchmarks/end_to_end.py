@@ -5,11 +5,11 @@
 
 The same task, networks (two layers of 256, ReLU, no layer norm), batch (256) and updates a frame,
 in processes that take turns on all cores for as many seconds each; while one is measured, the
-others wait. Ours run compiled (``_eager``: not), in the layout that suits two cores: where updates
-prevail the learner takes both and collects in between; where frames prevail a worker collects
-while it learns. Stable-Baselines3 collects and learns in turn, as it is built to. So does SBX, once
-with an update (``sbx``) and once with 16 in one compiled call (``sbx_scanned``) after the frames of
-one environment, and once after a step of eight environments in processes (``sbx_8_envs``).
+others wait. Ours run compiled (``_eager``: not), each in the way to share the cores that
+``collector=auto`` finds the fastest. Stable-Baselines3 collects and learns in turn, as it is built
+to. So does SBX, once with an update (``sbx``) and once with 16 in one compiled call
+(``sbx_scanned``) after the frames of one environment, and once after a step of eight environments
+in processes (``sbx_8_envs``).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from harness import Child, interleave, line
 from peers import PYTHON, peer_python
@@ -33,8 +34,8 @@ OURS = {
     "etl_explore": ("etl_explore", "compile=true"),
     "etl_learn_eager": ("etl_learn", "compile=false"),
 }
+FRAMES_PER_UPDATE = (1, 8)
 BY_DEFAULT = ("sac", "etl_learn", "etl_explore")
-COLLECTORS = {1: "collector=single", 8: "collector=process"}  # by frames per update
 PEERS = {  # library, and its environments
     "sbx": ("sbx", 1),
     "sbx_8_envs": ("sbx", 8),
@@ -55,24 +56,27 @@ def peer_cases(frames_per_update: int) -> dict[str, tuple[str, int]]:
 class Contender(Child):
     """A process that trains for as many seconds as it is told."""
 
-    def await_ready(self) -> str:
-        """Its versions, if it says them."""
+    def await_ready(self) -> dict[str, Any]:
+        """What it says of itself before: a peer its versions, ours how it shares the cores."""
         lines = list(iter(self.answer, "ready"))
-        return next((line for line in lines if line.startswith("{")), "{}")
+        return json.loads(next((line for line in lines if line.startswith("{")), "{}"))
 
     def frames_per_second(self, *order: float) -> float:
         return float(self.ask(" ".join(map(str, order))))
 
 
-def start_ours(task: str, frames_per_update: int, methods: list[str]) -> dict[str, Contender]:
+def start_ours(
+    task: str, frames_per_update: int, methods: list[str]
+) -> dict[str, tuple[Contender, dict[str, Any]]]:
+    """Our contenders, and how each shares the cores."""
     script = [sys.executable, HERE / "training.py", "--env", task]
     script += ["--frames-per-update", str(frames_per_update), "--method"]
-    layout = COLLECTORS[frames_per_update]
     ours = {}
     for name in methods:
         method, *overrides = OURS[name]
-        command = [*script, method, layout, *overrides]
-        ours[name] = Contender(command, stderr=subprocess.DEVNULL)
+        command = [*script, method, "collector=auto", *overrides]
+        contender = Contender(command, stderr=subprocess.DEVNULL)
+        ours[name] = contender, contender.await_ready()  # before the next tries out its own
     return ours
 
 
@@ -93,10 +97,8 @@ def compare(
     versions: dict[str, str],
 ) -> None:
     ours = start_ours(task, frames_per_update, arguments.methods)
-    for contender in ours.values():
-        contender.await_ready()
     seconds = arguments.seconds
-    cases = {name: partial(each.frames_per_second, seconds) for name, each in ours.items()}
+    cases = {name: partial(each.frames_per_second, seconds) for name, (each, _) in ours.items()}
     for name, (peer, at_once) in peer_cases(frames_per_update).items() if peers else ():
         order = seconds, frames_per_update, at_once
         cases[name] = partial(peers[peer].frames_per_second, *order)
@@ -110,9 +112,10 @@ def compare(
             values[name],
             peers={other: values[other] for other in others if name in ours},
             seconds=seconds,
+            **(ours[name][1] if name in ours else {}),
             **({"peer_versions": versions} if versions else {}),
         )
-    for contender in ours.values():
+    for contender, _ in ours.values():
         contender.close()
 
 
@@ -120,9 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--envs", nargs="+", default=("myoHandPenTwirl", "myoLegWalk"))
     parser.add_argument("--methods", nargs="*", choices=OURS, default=BY_DEFAULT)
-    parser.add_argument(
-        "--frames-per-update", nargs="+", type=int, default=(1, 8), choices=COLLECTORS
-    )
+    parser.add_argument("--frames-per-update", nargs="+", type=int, default=FRAMES_PER_UPDATE)
     parser.add_argument("--peer", default=PYTHON, help="Python of the peers, or none")
     parser.add_argument("--seconds", type=float, default=5.0, help="of one measurement")
     parser.add_argument("--repeats", type=int, default=2)
@@ -131,7 +132,7 @@ def main() -> None:
     for task in arguments.envs:
         peers, versions = start_peers(task, python), {}
         for peer in peers.values():
-            versions |= json.loads(peer.await_ready())
+            versions |= peer.await_ready()
         for frames_per_update in arguments.frames_per_update:
             compare(task, frames_per_update, peers, arguments, versions)
         for peer in peers.values():

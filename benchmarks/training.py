@@ -1,18 +1,22 @@
 """Our side of end_to_end.py: a stage, or plain SAC, training as told.
 
-Reads a number of seconds a line, trains for so long, and answers with the frames a second.
+How it shares the cores comes first, once it has made an update; then it reads a number of seconds a
+line, trains for so long, and answers with the frames a second.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 
+import torch
 from harness import recipe
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.layout import choose_layout
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import Stage, alone
 
@@ -41,7 +45,11 @@ def main() -> None:
         *arguments.overrides,
     ]
     method = "sac" if arguments.method == "sac" else "etl"
-    experiment = Experiment(recipe(*overrides, f"method={method}"))
+    config = recipe(*overrides, f"method={method}")
+    if config.collector.kind == "auto":
+        config = choose_layout(config)
+        torch.set_num_threads(config.threads)
+    experiment = Experiment(config)
     stage = build(experiment, arguments.method)
     stage.restart_collection()
 
@@ -51,6 +59,8 @@ def main() -> None:
 
     while not stage.progress.updates:
         step()
+    shared = {key: config.collector[key] for key in ("kind", "num_workers")}
+    print(json.dumps({**shared, "learner_threads": torch.get_num_threads()}))
     print("ready", flush=True)
     for line in sys.stdin:
         step()  # its frames may have been collected before
