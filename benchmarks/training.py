@@ -9,16 +9,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 
 import torch
 from harness import recipe
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.layout import choose_layout
+from torchrl_etl.layout import choose_layout, train_on, training_speed
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.training import Stage, alone
+from torchrl_etl.training import Stage
 
 
 def build(experiment: Experiment, method: str) -> Stage:
@@ -53,21 +52,13 @@ def main() -> None:
     stage = build(experiment, arguments.method)
     stage.restart_collection()
 
-    def step() -> None:
-        stage.collect()
-        alone(stage.learn())
-
     while not stage.progress.updates:
-        step()
+        train_on(stage)
     shared = {key: config.collector[key] for key in ("kind", "num_workers")}
     print(json.dumps({**shared, "learner_threads": torch.get_num_threads()}))
     print("ready", flush=True)
     for line in sys.stdin:
-        step()  # its frames may have been collected before
-        begun, before = time.perf_counter(), stage.frames
-        while time.perf_counter() - begun < float(line):
-            step()
-        print((stage.frames - before) / (time.perf_counter() - begun), flush=True)
+        print(training_speed(stage, float(line)), flush=True)
     stage.close()
 
 

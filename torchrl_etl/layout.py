@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from torchrl_etl.training import Stage
 
-__all__ = ["Layout", "choose_layout", "layouts"]
+__all__ = ["Layout", "choose_layout", "layouts", "train_on", "training_speed"]
 
 CLEARLY_FASTER = 1.05  # what processes of their own must gain to be worth it
 
@@ -131,13 +131,19 @@ def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
     torch.set_num_threads(layout.threads)
     stage.collect_from(**layout.collector)
     stage.restart_collection()
+    return training_speed(stage, seconds)
 
-    def step() -> None:
-        stage.collect()
-        alone(stage.learn())
 
-    step()  # compiles, and lets workers begin the batch that is ahead
+def train_on(stage: Stage) -> None:
+    """Collect a batch, and make the updates that it has earned."""
+    stage.collect()
+    alone(stage.learn())
+
+
+def training_speed(stage: Stage, seconds: float) -> float:
+    """Frames a second of a stage as it is."""
+    train_on(stage)  # compiles; its frames may have been collected before
     begun, before = time.perf_counter(), stage.frames
     while time.perf_counter() - begun < seconds or stage.frames == before:
-        step()
+        train_on(stage)
     return (stage.frames - before) / (time.perf_counter() - begun)

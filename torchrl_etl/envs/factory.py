@@ -246,7 +246,7 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
         # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
         env, faults = gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
     try:
-        if task.suite != "dm_control":  # which refuses them itself
+        if env_kwargs and task.suite != "dm_control":  # which refuses them itself
             check_known(env, task.name, env_kwargs)
         check_action_space(env.action_space, task.name)
     except ValueError:

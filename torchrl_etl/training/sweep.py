@@ -106,9 +106,9 @@ class Run:
     def rows(self, status: str) -> Iterator[dict[str, Any]]:
         """Its evaluations, oldest first."""
         folder = self.folder
-        if folder is None or not folder.versions:
+        if folder is None or not (starts := folder.versions):
             return
-        facts = folder.versions[-1]
+        facts = starts[-1]
         own = {"commit": facts.pop("commit"), "machine": facts.pop("machine")}
         own |= {"versions": json.dumps(facts), "status": status}
         own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
