@@ -38,6 +38,19 @@ TINY = (
     "threads=1",
 )
 
+ELBOW = "env=myoElbowPose1D6MFixed-v0"
+# The frames that a method takes before it learns, and what it learns besides.
+BRIEFLY = {
+    "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
+    "dynsyn": ["method.options.frames=200"],
+    "sar": [
+        "method.options.frames=48",
+        "method.options.rollout_frames=400",
+        "method.options.num_synergies=3",
+    ],
+    "eme": ["method.options.hidden=[16]"],
+}
+
 # What learner=plain takes away, given back to it.
 RESIDUAL = (
     "actor.body=residual",
@@ -59,6 +72,12 @@ def tiny(*overrides: str, name: str = "config", conf: Path = CONF) -> DictConfig
         if override not in kinds:
             OmegaConf.update(config, override.key_or_group, override.value())
     return config
+
+
+def rival(method: str, run: Path, *overrides: str) -> DictConfig:
+    """A method's tiny configuration on the elbow, its preparation short too, in folder `run`."""
+    brief = BRIEFLY.get(method, [])
+    return tiny(ELBOW, f"method={method}", "frames=608", f"run_dir='{run}'", *brief, *overrides)
 
 
 def _is_value(override: Override, conf: Path) -> bool:

@@ -16,8 +16,7 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.commands import command
-from tests.configs import CONF, tiny
-from tests.test_training_methods import BRIEFLY, ELBOW
+from tests.configs import BRIEFLY, CONF, ELBOW, tiny
 from torchrl_etl import zoo
 from torchrl_etl.command_line import translate
 from torchrl_etl.envs import make_env

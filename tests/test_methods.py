@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,14 +10,13 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 
-from tests.configs import CONF, tiny
+from tests.configs import CONF, ELBOW, rival, tiny
 from tests.runs import numbers
 from tests.stages import fill, method_stage
 from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.sar import finished_episodes, rollouts
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import alone, resumed_config
@@ -27,22 +25,6 @@ from torchrl_etl.training.loop import StopOnSignal
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.endswith("_paper")]
-ELBOW = "env=myoElbowPose1D6MFixed-v0"
-BRIEFLY = {
-    "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
-    "dynsyn": ["method.options.frames=200"],
-    "sar": [
-        "method.options.frames=48",
-        "method.options.rollout_frames=400",
-        "method.options.num_synergies=3",
-    ],
-    "eme": ["method.options.hidden=[16]"],
-}
-
-
-def config(method: str, run: Path, *overrides: str):
-    brief = BRIEFLY.get(method, [])
-    return tiny(ELBOW, f"method={method}", "frames=608", f"run_dir='{run}'", *brief, *overrides)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -130,7 +112,7 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
     method, tmp_path, monkeypatch
 ):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    summary = Experiment(config(method, whole)).run()
+    summary = Experiment(rival(method, whole)).run()
     assert 608 <= summary["learn"]["frames_charged"] < 608 + 64
     first = {"dynsyn": 200, "sar": 448}.get(method, 0)
     assert summary["learn"]["frames"] == summary["learn"]["frames_charged"] - first
@@ -146,7 +128,7 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
     monkeypatch.setattr(Checkpoints, "save", save_and_die)
     with pytest.raises(ZeroDivisionError):
-        Experiment(config(method, broken)).run()
+        Experiment(rival(method, broken)).run()
     monkeypatch.undo()
     Experiment(resumed_config(broken), resume=broken).run()
     ours, theirs = numbers(broken), numbers(whole)
@@ -215,7 +197,7 @@ def controller(stage) -> DEPExploration:
 def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
     settings = ("method.options.dep_frames=640", f"learn.learning_starts={starts}")
     workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
-    run = config("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
+    run = rival("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
     stage = Experiment(run).method.stage()
     assert stage.learning_starts == expected
     assert controller(stage).dep_frames == 640 // 2 // 2  # actions of each worker
@@ -223,7 +205,7 @@ def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
 
 @pytest.mark.slow
 def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
-    stage = Experiment(config("dep", tmp_path / "run", "action_repeat=2")).method.stage()
+    stage = Experiment(rival("dep", tmp_path / "run", "action_repeat=2")).method.stage()
     stage.restart_collection()
     actions = stage.collect().numel()
     assert stage.frames == 2 * actions and controller(stage).frames == actions
@@ -233,7 +215,7 @@ def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
 
 
 def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
-    experiment = Experiment(config("dynsyn", tmp_path / "run"))
+    experiment = Experiment(rival("dynsyn", tmp_path / "run"))
     groups = experiment.run()["groups"]
     file = tmp_path / "run" / "muscle_groups.json"
     assert groups == json.loads(file.read_text())
@@ -252,7 +234,7 @@ def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
 
 
 def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
-    stage = Experiment(config("dynsyn", tmp_path / "run")).method.stage()
+    stage = Experiment(rival("dynsyn", tmp_path / "run")).method.stage()
     network = stage.learner.actor[0].module
     assert stage.budget == 408  # 608 without the recording; a third of it is 136
     for frames, amplitude in ((0, 0.0), (136, 0.0), (272, 0.05), (408, 0.1)):
@@ -264,7 +246,7 @@ def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
 
 @pytest.mark.slow
 def test_dynsyn_evaluates_with_the_deviations_of_the_last_batch(tmp_path):
-    experiment = Experiment(config("dynsyn", tmp_path / "run"))
+    experiment = Experiment(rival("dynsyn", tmp_path / "run"))
     experiment.run()
     stage = experiment.learned()
     network = next(m for m in stage.learner.policy.modules() if isinstance(m, DynSynNetwork))
@@ -278,97 +260,12 @@ def test_the_papers_dynsyn_deviates_as_published(tmp_path):
     assert network.amplitude.item() == pytest.approx(0.05)
 
 
-def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
-    following = {
-        "done": torch.tensor(done),
-        "episode_reward": torch.tensor(so_far),
-        "activation": torch.eye(len(done)),
-    }
-    return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
-
-
-def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
-    far = 5 + (2 << 32)  # an episode of another machine
-    rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
-    found = finished_episodes(rows)
-    assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
-    assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
-    assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
-
-
-def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
-    sar = Experiment(config("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
-    # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
-    # taken, and 9 is though 11 is better.
-    rows = fresh([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
-    assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
-    # Of two episodes one is the preview at most, and of one none.
-    assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
-    assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
-
-
-def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
-    sar = Experiment(
-        config("sar", tmp_path / "run", "learn.sac.normalize_observations=true")
-    ).method
-    play = sar.play_stage()
-    play.restart_collection()
-    seen = play.collect()["next", "episode_reward"].clone()
-    before = {key: value.clone() for key, value in play.learner.actor.state_dict().items()}
-    norm, frames, kept = (
-        play.learner.objective.normalizer.count.clone(),
-        play.frames,
-        len(play.buffer),
-    )
-    checks = []
-    rows = rollouts(play, 400, lambda: checks.append(None))
-    assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
-    assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
-    assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
-    assert (play.frames, len(play.buffer), play.learner.objective.normalizer.count) == (
-        frames,
-        kept,
-        norm,
-    )
-    assert all(
-        torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items()
-    )
-
-
-@pytest.mark.slow
-def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
-    run = tmp_path / "run"
-    other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
-    experiment = Experiment(config("sar", run, other_task))
-    play = experiment.method.play_stage()
-    play.restart_collection()
-    goals = play.collect()["observation"]
-    play.close()
-    other = Experiment(config("sar", run)).method.play_stage()
-    other.restart_collection()
-    assert not torch.equal(other.collect()["observation"], goals)
-    other.close()
-    assert experiment.run()["learn"]["frames_charged"] >= 608
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("rollout_frames=300", r"need 400 for two whole episodes of 100 steps"),
-        ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
-    ],
-)
-def test_sar_objects_to_play_that_cannot_serve_before_it_begins(option, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        Experiment(config("sar", tmp_path / "run", f"method.options.{option}"))
-
-
 def test_options_for_legs_and_hands_follow_the_root_of_the_body(tmp_path):
     of_the_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.of_the_body
     assert of_the_body({"legs": 1.0, "hands": 0.66}) == 1.0
     assert of_the_body(0.5) == 0.5
-    assert Experiment(config("sar", tmp_path / "run")).method.blend == 0.66
-    one_number = config("dynsyn", tmp_path / "run", "method.options.amplitude=5")
+    assert Experiment(rival("sar", tmp_path / "run")).method.blend == 0.66
+    one_number = rival("dynsyn", tmp_path / "run", "method.options.amplitude=5")
     assert Experiment(one_number).method.amplitude == 5
 
 

@@ -1,0 +1,94 @@
+"""SAR plays first, and learns on what its best episodes did."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.configs import rival
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods.sar import finished_episodes, rollouts
+
+
+def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
+    following = {
+        "done": torch.tensor(done),
+        "episode_reward": torch.tensor(so_far),
+        "activation": torch.eye(len(done)),
+    }
+    return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
+
+
+def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
+    far = 5 + (2 << 32)  # an episode of another machine
+    rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
+    found = finished_episodes(rows)
+    assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
+    assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
+    assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
+
+
+def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
+    sar = Experiment(rival("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
+    # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
+    # taken, and 9 is though 11 is better.
+    rows = fresh([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
+    assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
+    # Of two episodes one is the preview at most, and of one none.
+    assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
+    assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
+
+
+def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
+    sar = Experiment(rival("sar", tmp_path / "run", "learn.sac.normalize_observations=true")).method
+    play = sar.play_stage()
+    play.restart_collection()
+    seen = play.collect()["next", "episode_reward"].clone()
+    before = {key: value.clone() for key, value in play.learner.actor.state_dict().items()}
+    norm, frames, kept = (
+        play.learner.objective.normalizer.count.clone(),
+        play.frames,
+        len(play.buffer),
+    )
+    checks = []
+    rows = rollouts(play, 400, lambda: checks.append(None))
+    assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
+    assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
+    assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
+    assert (play.frames, len(play.buffer), play.learner.objective.normalizer.count) == (
+        frames,
+        kept,
+        norm,
+    )
+    assert all(
+        torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items()
+    )
+
+
+@pytest.mark.slow
+def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
+    run = tmp_path / "run"
+    other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
+    experiment = Experiment(rival("sar", run, other_task))
+    play = experiment.method.play_stage()
+    play.restart_collection()
+    goals = play.collect()["observation"]
+    play.close()
+    other = Experiment(rival("sar", run)).method.play_stage()
+    other.restart_collection()
+    assert not torch.equal(other.collect()["observation"], goals)
+    other.close()
+    assert experiment.run()["learn"]["frames_charged"] >= 608
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("rollout_frames=300", r"need 400 for two whole episodes of 100 steps"),
+        ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
+    ],
+)
+def test_sar_objects_to_play_that_cannot_serve_before_it_begins(option, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Experiment(rival("sar", tmp_path / "run", f"method.options.{option}"))
