@@ -52,7 +52,8 @@ SYNERGIES = (
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError, ImportError, gymnasium.error.Error):
+    beforehand = (ValueError, OSError, ImportError, gymnasium.error.Error)
+    with one_sentence(*beforehand, SimulationError, CollectionError):
         experiments = list(asked_for(config, list(HydraConfig.get().overrides.task)))
     with StopOnSignal() as stop:
         ends = together([experiment.work(stop) for experiment in experiments])
