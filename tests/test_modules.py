@@ -247,6 +247,16 @@ def test_actor_fills_mixed_bounds_and_concatenates_its_inputs() -> None:
     assert (unit.amin(0) < -0.9).all() and (unit.amax(0) > 0.9).all()
 
 
+def test_quiet_entries_have_a_fixed_deviation_that_nothing_learns() -> None:
+    spec = Bounded(-1, 1, shape=(5,))
+    actor = make_actor({"observation": 3}, spec, hidden=(8,), quiet=3, quiet_std=0.02)
+    distribution = actor.get_dist(TensorDict({"observation": torch.randn(7, 3)}, [7]))
+    assert (distribution.scale[:, 2:] == 0.02).all() and (distribution.scale[:, :2] > 0.5).all()
+    distribution.scale.sum().backward()
+    weight = actor[0].module[-3].weight.grad  # of the head: five means, five deviations
+    assert (weight[:5] == 0).all() and (weight[7:] == 0).all() and (weight[5:7] != 0).any()
+
+
 @pytest.mark.parametrize("layer_norm", [True, False])
 def test_layer_norm_follows_every_hidden_layer_or_none(layer_norm: bool) -> None:
     network = {"hidden": (16, 12), "layer_norm": layer_norm}

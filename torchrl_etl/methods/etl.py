@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import safetensors.torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import Bounded
 
 from torchrl_etl import zoo
 from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real, naming
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.io import surviving_folder, write_atomically
-from torchrl_etl.learners import Term
+from torchrl_etl.learners import Term, entropy_target
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SynergyDecoder, make_actor
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import (
     BundleInfo,
@@ -208,11 +210,16 @@ class ETL(Method):
             check_choice("fine_tuning", mode := options["fine_tuning"], get_args(FineTuning))
             check_real("[0, inf)", distillation_weight=options["distillation_weight"])
             check_real("(0, inf)", lr=options["lr"])
+            if options["residual_std"] is not None:
+                check_real("(0, inf)", residual_std=options["residual_std"])
+                check_real("(0, 1]", residual=options["residual"])
         weight = {"frozen": 0.0, "reconstruction": 1.0}.get(mode, options["distillation_weight"])
         decoder = decoder.to(self.context.device).requires_grad_(mode != "frozen")
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder,
+            make_actor=partial(make_actor, **self._quiet),
+            entropy=self._entropy_target,
             more=lambda actor: {
                 "train_decoder": mode == "critic",
                 "terms": [Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])],
@@ -220,6 +227,24 @@ class ETL(Method):
         )
         room = self.context.config.explore.frames if self.prefills else 0
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)
+
+    def actor(self) -> dict[str, Any]:
+        return {**super().actor(), **self._quiet}
+
+    @property
+    def _quiet(self) -> dict[str, Any]:
+        """Arguments of the actor where the noise of the residual is fixed."""
+        std = self.context.config.learn.decoder.residual_std
+        return {} if std is None else {"quiet": self.context.spec.action_dim, "quiet_std": std}
+
+    def _entropy_target(self, emitted: Bounded, std: float | None) -> float | Literal["auto"]:
+        """The target of what the actor emits; of a residual with fixed noise, what it has."""
+        if not self._quiet:
+            return entropy_target(emitted, std)
+        loud = emitted.shape[-1] - self._quiet["quiet"]
+        wanted = entropy_target(emitted[:loud], std)
+        fixed = entropy_target(emitted[loud:], self._quiet["quiet_std"])
+        return (-loud if wanted == "auto" else wanted) + fixed
 
     def begin(self, stage: Stage) -> None:
         if self.prefills:

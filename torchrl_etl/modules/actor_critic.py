@@ -13,7 +13,13 @@ from torch.distributions import Distribution
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_etl.checks import check_choice, check_flag, check_sizes
+from torchrl_etl.checks import (
+    check_choice,
+    check_flag,
+    check_positive,
+    check_real,
+    check_sizes,
+)
 
 __all__ = ["Body", "actor_with", "make_actor", "make_critic", "make_layers", "start_small"]
 
@@ -57,6 +63,21 @@ class _ResidualBlock(nn.Sequential):
             return hidden + super().forward(hidden)
 
 
+class _QuietTail(nn.Module):
+    """Gives the last entries of a Gaussian one fixed standard deviation."""
+
+    def __init__(self, count: int, std: float) -> None:
+        check_positive(quiet=count)
+        check_real("(0, inf)", quiet_std=std)
+        super().__init__()
+        self.count, self.std = count, std
+
+    def forward(self, parameters: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        loc, scale = parameters
+        tail = torch.full_like(scale[..., -self.count :], self.std)
+        return loc, torch.cat([scale[..., : -self.count], tail], -1)
+
+
 def make_layers(
     in_features: int, out_features: int, body: Body, hidden: Sequence[int], layer_norm: bool
 ) -> nn.Sequential:
@@ -95,6 +116,8 @@ def make_actor(
     body: Body = "mlp",
     hidden: Sequence[int] = (256, 256),
     layer_norm: bool = True,
+    quiet: int = 0,
+    quiet_std: float = 0.05,
 ) -> ProbabilisticActor:
     """Tanh-Gaussian actor whose samples fill the bounds of ``action_spec``.
 
@@ -110,6 +133,8 @@ def make_actor(
             of the time on processors with instructions for it, slower on others.
         hidden (sequence of int): widths of the hidden layers, or of the residual blocks.
         layer_norm (bool): normalise each hidden layer, or what enters each block.
+        quiet (int): so many of the last entries have a fixed standard deviation before the tanh,
+            ``quiet_std``; the others' is learned. Default: 0.
 
     Keys:
         reads ``inputs``; writes ``loc``, ``scale`` [*, n] (before the tanh) and ``out_key`` [*, n].
@@ -127,6 +152,8 @@ def make_actor(
     layers = make_layers(sum(inputs.values()), 2 * action_spec.shape[-1], body, hidden, layer_norm)
     start_small(layers)
     layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
+    if quiet:
+        layers.append(_QuietTail(quiet, quiet_std))
     return actor_with(TanhNormal, layers, inputs, ["loc", "scale"], action_spec, out_key)
 
 
