@@ -255,7 +255,7 @@ def test_bad_specs_and_settings_are_refused() -> None:
         with pytest.raises(ValueError, match="probability at most 1"):
             DEPExploration(SPEC, **settings)
     for settings in ({"intervention_length": 0}, {"policy_every": 0}):
-        with pytest.raises(ValueError, match="positive integer"):
+        with pytest.raises(ValueError, match="whole number, 1 or more"):
             DEPExploration(SPEC, **settings)
 
 

@@ -81,7 +81,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("explore.fit.actions=activation", "activation"),
         ("learn.critic.bins=51", "categorical critics need a bound on returns"),
         ("learn.noise.kind=hold", "choose one of independent, held"),
-        ("learn.sac.num_critics=0", "learn.sac.num_critics is 0; it must be a positive integer"),
+        ("learn.sac.num_critics=0", "learn.sac.num_critics is 0; it must be a whole number"),
         ("learn.noise.kind=held learn.noise.exponent=0", "learn.noise.exponent is 0; it must be"),
         ("learn.noise.kind=held learn.noise.longest=x", "learn.noise.longest is 'x'; it must be"),
         ("learn.sac.lr_end=2", "learn.sac.lr_end is 2; it must be a number in [0, 1]"),

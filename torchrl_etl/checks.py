@@ -17,7 +17,6 @@ __all__ = [
     "check_choice",
     "check_flag",
     "check_integer",
-    "check_positive",
     "check_real",
     "check_sizes",
     "naming",
@@ -39,21 +38,6 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         near = difflib.get_close_matches(str(value), choices, n=1)
         hint = f" (nearest: {near[0]})" if near else ""
         raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
-
-
-def check_positive(**sizes: object) -> None:
-    """Raise a ``ValueError`` naming the first size that is not a positive integer.
-
-    Examples:
-        >>> check_positive(latent_dim=4)
-        >>> check_positive(latent_dim=0)
-        Traceback (most recent call last):
-        ...
-        ValueError: latent_dim is 0; it must be a positive integer.
-    """
-    for name, size in sizes.items():
-        if not _is_integer(size) or size < 1:
-            raise ValueError(f"{name} is {size!r}; it must be a positive integer.")
 
 
 def check_integer(least: int, **values: object) -> None:

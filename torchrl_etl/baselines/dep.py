@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_etl.checks import check_choice, check_positive
+from torchrl_etl.checks import check_choice, check_integer
 
 __all__ = ["DEPController", "DEPExploration"]
 
@@ -87,7 +87,7 @@ class DEPController:
         device: torch.device | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        check_positive(num_muscles=num_muscles, tau=tau, time_distance=time_distance)
+        check_integer(1, num_muscles=num_muscles, tau=tau, time_distance=time_distance)
         check_choice("normalize", normalize, ("rows", "columns"))
         if kappa <= 0 or bias_rate < 0 or s4avg < 1:
             raise ValueError(
@@ -255,7 +255,7 @@ class DEPExploration(TensorDictModuleBase):
                 f"action_spec has shape {list(action_spec.shape)} but must be [actuators]; pass "
                 "the unbatched one, such as env.full_action_spec_unbatched['action']."
             )
-        check_positive(intervention_length=intervention_length, policy_every=policy_every)
+        check_integer(1, intervention_length=intervention_length, policy_every=policy_every)
         if dep_frames < 0 or not 0 <= probability <= 1:
             raise ValueError(
                 f"dep_frames is {dep_frames} and probability {probability}; they must be at least "

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.baselines.lattice import LatticeNetwork, StateDependentSpread
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 
 __all__ = ["LatticeNoise"]
 
@@ -71,7 +71,7 @@ class LatticeNoise(TensorDictModuleBase):
         freq: int = 8,
         init_key: NestedKey = "is_init",
     ) -> None:
-        check_positive(freq=freq)
+        check_integer(1, freq=freq)
         network = getattr(actor[0], "module", None)
         if not isinstance(network, LatticeNetwork):
             raise TypeError(

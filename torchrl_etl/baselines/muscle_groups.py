@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, step_mdp
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.envs import body_joints, mujoco_state
 from torchrl_etl.extras import extra
 
@@ -56,7 +56,7 @@ def record_muscle_lengths(
         >>> record_muscle_lengths(env, 20, amplitude=1.0).shape
         torch.Size([20, 1])
     """
-    check_positive(frames=frames, every=every)
+    check_integer(1, frames=frames, every=every)
     if not amplitude > 0:
         raise ValueError(f"amplitude is {amplitude}; it is a largest velocity and must be above 0.")
     if env.batch_size:
@@ -121,7 +121,7 @@ def group_muscles(
         >>> group_muscles(torch.stack([slow, fast, 2 * slow, 5 + fast], -1), 2)
         tensor([0, 1, 0, 1])
     """
-    check_positive(num_groups=num_groups, chunk=chunk, restarts=restarts)
+    check_integer(1, num_groups=num_groups, chunk=chunk, restarts=restarts)
     if lengths.ndim != 2 or len(lengths) < chunk or num_groups > lengths.shape[1]:
         raise ValueError(
             f"lengths has shape {tuple(lengths.shape)}; {num_groups} groups from chunks of {chunk} "

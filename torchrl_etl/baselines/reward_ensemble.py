@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 
 __all__ = ["RewardEnsemble", "diversity_scale"]
 
@@ -85,7 +85,7 @@ class RewardEnsemble(TensorDictModule):
         in_keys: Sequence[NestedKey] = ("observation", "action"),
         out_keys: Sequence[NestedKey] = ("reward_prediction",),
     ) -> None:
-        check_positive(observation_dim=observation_dim, action_dim=action_dim, size=size)
+        check_integer(1, observation_dim=observation_dim, action_dim=action_dim, size=size)
         members = _Members(
             MLP(observation_dim + action_dim, 1, num_cells=list(hidden), activation_class=nn.ReLU)
             for _ in range(size)

@@ -10,7 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.synergies.sar import independent_components
@@ -276,7 +276,7 @@ def _bounds(low: Any, high: Any, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _check_actions(actions: Tensor, num_synergies: int, low: Any, high: Any) -> None:
-    check_positive(num_synergies=num_synergies)
+    check_integer(1, num_synergies=num_synergies)
     is_real = actions.is_floating_point() and actions.isfinite().all()
     if actions.ndim != 2 or not len(actions) or not is_real:
         raise ValueError(

@@ -14,6 +14,7 @@ from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
+from torchrl_etl.checks import check_integer
 from torchrl_etl.envs.action_space import FlatAction, check_action_space
 from torchrl_etl.envs.arguments import argument_errors, check_known
 from torchrl_etl.envs.myosuite import register_myosuite
@@ -113,9 +114,7 @@ def make_env(
         >>> rollout["next", "solved"].shape, rollout["next", "solved"].dtype
         (torch.Size([2, 3, 1]), torch.bool)
     """
-    for argument, value in {"num_envs": num_envs, "action_repeat": action_repeat}.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{argument} must be a positive integer, got {value!r}.")
+    check_integer(1, num_envs=num_envs, action_repeat=action_repeat)
     task = resolve_task(name, goal)
     build = partial(
         _build,

@@ -11,7 +11,7 @@ from torchrl.envs.transforms.rnd import RunningMeanStd
 from torchrl.modules import MLP
 from torchrl.objectives import RNDLoss
 
-from torchrl_etl.checks import check_positive, check_real, check_sizes, naming
+from torchrl_etl.checks import check_integer, check_real, check_sizes, naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.learners.term import Term
@@ -50,7 +50,7 @@ class RNDExploration(Exploration):
         bonus: Mapping[str, Any],
     ) -> None:
         super().__init__(spec)
-        check_positive(features=features)
+        check_integer(1, features=features)
         check_sizes(hidden=hidden)
         check_real("(0, inf)", lr=lr)
         target, predictor = (

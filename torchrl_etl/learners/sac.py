@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from torchrl_etl.checks import check_flag, check_positive, check_real
+from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -114,7 +114,7 @@ class SACLearner:
         check_real("(0, 1]", tau=tau)
         check_real("[0, 1]", lr_end=lr_end)
         check_real("(0, inf)", lr=lr, alpha_init=alpha_init)
-        check_positive(num_critics=num_critics, bins=bins)
+        check_integer(1, num_critics=num_critics, bins=bins)
         check_flag(unit_rows=unit_rows)
         if return_bound is not None:
             check_real("(0, inf)", return_bound=return_bound)

@@ -16,7 +16,7 @@ from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhN
 from torchrl_etl.checks import (
     check_choice,
     check_flag,
-    check_positive,
+    check_integer,
     check_real,
     check_sizes,
 )
@@ -67,7 +67,7 @@ class _QuietTail(nn.Module):
     """Gives the last entries of a Gaussian one fixed standard deviation."""
 
     def __init__(self, count: int, std: float) -> None:
-        check_positive(quiet=count)
+        check_integer(1, quiet=count)
         check_real("(0, inf)", quiet_std=std)
         super().__init__()
         self.count, self.std = count, std

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.modules.recorded_actions import as_bounds
 
 __all__ = ["GMVAE", "ActionDecoder", "Posterior"]
@@ -77,7 +77,7 @@ class ActionDecoder(nn.Module):
         hidden: Sequence[int] = (128, 128),
     ) -> None:
         super().__init__()
-        check_positive(latent_dim=latent_dim, action_dim=action_dim)
+        check_integer(1, latent_dim=latent_dim, action_dim=action_dim)
         low, high = as_bounds(low, high, action_dim)
         self.latent_dim, self.action_dim, self.hidden = latent_dim, action_dim, tuple(hidden)
         self.mlp = MLP(latent_dim, action_dim, num_cells=list(hidden), activation_class=nn.ELU)
@@ -147,7 +147,7 @@ class GMVAE(nn.Module):
     ) -> None:
         super().__init__()
         num_components = latent_dim if num_components is None else num_components
-        check_positive(num_components=num_components)
+        check_integer(1, num_components=num_components)
         self.decoder = ActionDecoder(
             latent_dim, action_dim, low=low, high=high, hidden=tuple(reversed(hidden))
         )

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchrl_etl.checks import check_positive, check_real
+from torchrl_etl.checks import check_integer, check_real
 
 __all__ = ["HeldNormal", "PinkNormal"]
 
@@ -35,7 +35,7 @@ class HeldNormal:
 
     def __init__(self, longest: int, exponent: float = 2.0) -> None:
         check_real("(0, inf)", exponent=exponent)
-        check_positive(longest=longest)
+        check_integer(1, longest=longest)
         self._chances = torch.arange(1, longest + 1, dtype=torch.float64).pow(-exponent)
         self._noise: Tensor | None = None
         self._left: Tensor | None = None
@@ -81,7 +81,7 @@ class PinkNormal:
     """
 
     def __init__(self, longest: int) -> None:
-        check_positive(longest=longest)
+        check_integer(1, longest=longest)
         constants = 2.0 ** torch.arange(1 + int(math.log2(longest)))
         self._kept = torch.exp(-1 / constants)
         self._parts: Tensor | None = None

@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 
 __all__ = ["GaussianDynamics", "StateEncoder"]
 
@@ -63,7 +63,7 @@ class StateEncoder(TensorDictModule):
         in_keys: Sequence[NestedKey] = ("observation",),
         out_keys: Sequence[NestedKey] = ("embedding",),
     ) -> None:
-        check_positive(observation_dim=observation_dim, embedding_dim=embedding_dim)
+        check_integer(1, observation_dim=observation_dim, embedding_dim=embedding_dim)
         if not hidden:
             raise ValueError(
                 "hidden is empty; give at least one width, for the layer that is normalized."
@@ -124,7 +124,7 @@ class GaussianDynamics(TensorDictModule):
         in_keys: Sequence[NestedKey] = ("embedding",),
         out_keys: Sequence[NestedKey] = ("next_embedding_loc", "next_embedding_scale"),
     ) -> None:
-        check_positive(embedding_dim=embedding_dim)
+        check_integer(1, embedding_dim=embedding_dim)
         super().__init__(
             _GaussianHead(embedding_dim, hidden), in_keys=list(in_keys), out_keys=list(out_keys)
         )

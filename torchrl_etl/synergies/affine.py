@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.modules.synergy_decoder import NEAREST, percentile_box
@@ -42,7 +42,7 @@ class AffineSynergies(SynergyModel):
     """As far up as a muscle may be in the middle of the box, where the bounds are ±1."""
 
     def __init__(self, low: Tensor, high: Tensor, num_synergies: int) -> None:
-        check_positive(num_synergies=num_synergies)
+        check_integer(1, num_synergies=num_synergies)
         if num_synergies > len(low):
             raise ValueError(
                 f"num_synergies is {num_synergies} but there are only {len(low)} actuators; "

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.extras import extra
 from torchrl_etl.synergies.affine import AffineSynergies
 
@@ -51,7 +51,7 @@ class NMFSynergies(AffineSynergies):
     def __init__(
         self, low: Tensor, high: Tensor, num_synergies: int, *, max_iter: int = 500
     ) -> None:
-        check_positive(max_iter=max_iter)
+        check_integer(1, max_iter=max_iter)
         super().__init__(low, high, num_synergies)
         self.max_iter = max_iter
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_etl.checks import check_integer, check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.extras import extra
 from torchrl_etl.synergies.affine import AffineSynergies
 
@@ -55,7 +55,7 @@ class SARSynergies(AffineSynergies):
         max_iter: int = 1000,
         seed: int = 0,
     ) -> None:
-        check_positive(max_iter=max_iter)
+        check_integer(1, max_iter=max_iter)
         check_integer(0, seed=seed)
         super().__init__(low, high, num_synergies)
         self.max_iter, self.seed = max_iter, seed

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_etl.checks import check_positive
+from torchrl_etl.checks import check_integer
 from torchrl_etl.transforms.keys import (
     group_reset,
     group_shape,
@@ -86,7 +86,7 @@ class DirectionPrimer(TensorDictPrimer):
         num_directions: int | None = None,
         out_key: NestedKey = "direction",
     ) -> None:
-        check_positive(embedding_dim=embedding_dim)
+        check_integer(1, embedding_dim=embedding_dim)
         if kind not in ("sphere", "orthonormal"):
             raise ValueError(f"kind is {kind!r}; choose 'sphere' or 'orthonormal'.")
         if kind == "sphere" and num_directions is not None:
@@ -95,7 +95,7 @@ class DirectionPrimer(TensorDictPrimer):
                 "directions; pass kind='orthonormal' or drop num_directions."
             )
         num_directions = embedding_dim if num_directions is None else num_directions
-        check_positive(num_directions=num_directions)
+        check_integer(1, num_directions=num_directions)
         if num_directions > embedding_dim:
             raise ValueError(
                 f"num_directions is {num_directions}, but only {embedding_dim} orthonormal "
