@@ -31,7 +31,6 @@ class LossChecks(ABC):
         targets: names of the target networks, such as ``target_encoder_params``.
         per_sample: outputs that have the batch's shape under ``reduction="none"``.
         optional_keys: in keys that a batch may lack.
-        vmapped: ``False`` where the policy's distribution draws as ``torch.vmap`` cannot.
         recorded: in keys that are data and targets to the loss: no gradient may flow into them.
     """
 
@@ -41,7 +40,6 @@ class LossChecks(ABC):
     per_sample: ClassVar[set[str] | None] = None
     optional_keys: ClassVar[set[NestedKey]] = set()
     recorded: ClassVar[set[NestedKey]] = set()
-    vmapped: ClassVar[bool] = True
 
     @abstractmethod
     def make_loss(self, *, nested: bool = False, **kwargs: Any) -> LossModule:
@@ -254,8 +252,6 @@ class LossChecks(ABC):
     # Several seeds at once
 
     def test_vmap_over_stacked_parameters_gives_what_single_losses_give(self) -> None:
-        if not self.vmapped:
-            pytest.skip("draws as torch.vmap cannot")
         losses = [self.built() for _ in range(3)]
         for parameter in (p for loss in losses for p in loss.parameters()):
             parameter.data += 0.05 * torch.randn_like(parameter)
@@ -285,8 +281,6 @@ class LossChecks(ABC):
 
     def test_vmap_with_different_randomness_draws_for_every_seed(self) -> None:
         """Equal seeds differ in their draws alone; a loss without draws gives equal numbers."""
-        if not self.vmapped:
-            pytest.skip("draws as torch.vmap cannot")
         loss, data = self.built(), self.data()
         draws = not all(
             torch.equal(first, second)

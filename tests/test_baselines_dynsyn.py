@@ -54,7 +54,12 @@ def test_groups_that_are_not_numbered_are_refused(wrong: list) -> None:
 def grouped(amplitude: float = 0.1, rows: int = 50, **bounds: Tensor) -> GroupedTanhNormal:
     loc, scale = torch.randn(rows, 3), torch.rand(rows, 3) + 0.1
     return GroupedTanhNormal(
-        loc, scale, torch.randn(rows, 3), torch.full((rows, 1), amplitude), groups=GROUPS, **bounds
+        loc,
+        scale,
+        torch.randn(rows, 3),
+        torch.full((rows, 1), amplitude),
+        *MuscleGroups.of(GROUPS),
+        **bounds,
     )
 
 
@@ -85,7 +90,11 @@ def test_weights_by_hand() -> None:
     # Group actions tanh(1), tanh(-1), tanh(5); weights 1 + clip(0.1 tanh v, ±0.08).
     v = torch.tensor([0.5, 3.0, -0.5])
     dist = GroupedTanhNormal(
-        torch.tensor([1.0, -1.0, 5.0]), torch.ones(3), v, torch.tensor([0.08]), groups=GROUPS
+        torch.tensor([1.0, -1.0, 5.0]),
+        torch.ones(3),
+        v,
+        torch.tensor([0.08]),
+        *MuscleGroups.of(GROUPS),
     )
     y = [math.tanh(1), math.tanh(-1), math.tanh(5)]
     small = 0.1 * math.tanh(0.5)
@@ -102,7 +111,7 @@ def test_deviations_are_drawn_with_the_printed_spread() -> None:
         torch.full_like(mu, 0.3),
         mu,
         torch.full_like(mu[:1], 0.1),
-        groups=GROUPS,
+        *MuscleGroups.of(GROUPS),
     )
     v = (10 * (weights_of(dist.sample((100_000,)))[:, [2, 4, 5]] - 1)).atanh()
     torch.testing.assert_close(v.mean(0), mu, atol=0.03, rtol=0)
@@ -128,7 +137,7 @@ def test_actions_stay_in_every_muscles_own_bounds() -> None:
     dist = GroupedTanhNormal(
         *(10 * torch.randn(500, 3), torch.ones(500, 3), torch.randn(500, 3)),
         torch.tensor([0.1]),
-        groups=GROUPS,
+        *MuscleGroups.of(GROUPS),
         low=LOW,
         high=HIGH,
     )
@@ -144,7 +153,13 @@ def test_actions_stay_in_every_muscles_own_bounds() -> None:
 def test_one_muscle_a_group_is_the_ordinary_tanh_normal() -> None:
     loc, scale = torch.randn(2, 5, 6)
     dist = GroupedTanhNormal(
-        loc, scale.exp(), torch.zeros(5, 0), torch.zeros(5, 1), groups=range(6), low=LOW, high=HIGH
+        loc,
+        scale.exp(),
+        torch.zeros(5, 0),
+        torch.zeros(5, 1),
+        *MuscleGroups.of(range(6)),
+        low=LOW,
+        high=HIGH,
     )
     theirs = TanhNormal(loc, scale.exp(), low=LOW, high=HIGH)
     torch.manual_seed(1)
@@ -279,7 +294,6 @@ def test_acts_on_bare_arrays_as_the_vector_collector_has_them() -> None:
 class TestDynSynSAC(synergy.TestSynergySACLoss):
     """LeanSACLoss on a DynSyn actor passes the check list of losses."""
 
-    vmapped = False
     default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
     trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
 

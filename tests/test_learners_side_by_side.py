@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
 
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.baselines import make_dynsyn_actor, set_frames
+from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.learners.side_by_side import stacked
+from torchrl_etl.modules import make_critic
 
 SEEDS = (0, 1)
 MAKERS = {
@@ -41,18 +45,12 @@ def draws(group, batches):
     return drawn
 
 
-@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-def test_gradients_of_stacked_learners_are_those_of_each(make):
-    stages = [make(f"seed={seed}") for seed in SEEDS]
-    for stage in stages:
-        fill(stage)
-        stage.close()
-    batches = [stage.sample() for stage in stages]
+def assert_gradients_are_those_of_each(learners, batches):
     alone = []
-    for seed, stage, batch in zip(SEEDS, stages, batches, strict=True):
+    for seed, learner, batch in zip(SEEDS, learners, batches, strict=True):
         torch.manual_seed(seed)
-        alone.append(stage.learner.gradients(batch))
-    group = SideBySide([stage.learner for stage in stages])
+        alone.append(learner.gradients(batch))
+    group = SideBySide(learners)
     together, scalars = group.gradients(stacked(batches, draws(group, batches)))
     for (expected, logged), found, log in zip(alone, together, scalars.unbind(0), strict=True):
         assert len(found) == len(expected)
@@ -62,6 +60,32 @@ def test_gradients_of_stacked_learners_are_those_of_each(make):
                 torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
         for key, value in logged.items():
             torch.testing.assert_close(log[key], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_gradients_of_stacked_learners_are_those_of_each(make):
+    stages = [make(f"seed={seed}") for seed in SEEDS]
+    for stage in stages:
+        fill(stage)
+        stage.close()
+    batches = [stage.sample() for stage in stages]
+    assert_gradients_are_those_of_each([stage.learner for stage in stages], batches)
+
+
+def test_stacked_learners_have_each_its_own_groups_of_muscles():
+    spec = Bounded(torch.tensor([-1.0, 0.0, -3.0, 0.1]), torch.tensor([1.0, 1.0, 5.0, 0.7]))
+    learners, batches = [], []
+    for groups in ([0, 1, 0, 1], [0, 0, 1, 1]):
+        actor = make_dynsyn_actor({"observation": 3}, spec, groups, hidden=(8,), slope=1.0, start=0)
+        set_frames(actor, 1)
+        critic = make_critic({"observation": 3, "action": 4}, hidden=(8,))
+        learners.append(SACLearner(actor, critic, action_spec=spec))
+        end = torch.zeros(32, 1, dtype=torch.bool)
+        following = {"reward": torch.randn(32, 1), "done": end, "terminated": end}
+        following["observation"] = torch.randn(32, 3)
+        entries = {"observation": torch.randn(32, 3), "action": spec.rand((32,))}
+        batches.append(TensorDict({**entries, "next": following}, [32]))
+    assert_gradients_are_those_of_each(learners, batches)
 
 
 def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():

@@ -79,19 +79,18 @@ class GroupedTanhNormal(D.Distribution):
         loc, scale (Tensor): of the groups [*, k], before the tanh.
         weight_loc (Tensor): mean of v [*, n - k], for members that are not first, in their order.
         amplitude (Tensor): largest deviation of a weight from 1 [*, 1], in [0, 0.1].
+        group, first, slot (Tensor): the groups [*, n], [*, k] and [*, n], see
+            :class:`MuscleGroups`.
 
     Keyword Args:
-        groups (MuscleGroups, Tensor or sequence of int): number of each muscle's group [n].
         low, high (float or Tensor): bounds, one number or [n]. Default: ±1.
         weight_scale (float): standard deviation of v. Default: e^0.5.
 
-    Raises:
-        ValueError: if group numbers are not 0, 1, ..., k - 1.
-
     Examples:
         >>> import torch
+        >>> groups = MuscleGroups.of([0, 1, 0])
         >>> grouped = GroupedTanhNormal(
-        ...     torch.zeros(2), torch.ones(2), torch.zeros(1), torch.zeros(1), groups=[0, 1, 0]
+        ...     torch.zeros(2), torch.ones(2), torch.zeros(1), torch.zeros(1), *groups
         ... )
         >>> action = grouped.sample()
         >>> bool(action[0] == action[2]), bool(action[0] == action[1])
@@ -107,20 +106,21 @@ class GroupedTanhNormal(D.Distribution):
         scale: Tensor,
         weight_loc: Tensor,
         amplitude: Tensor,
+        group: Tensor,
+        first: Tensor,
+        slot: Tensor,
         *,
-        groups: MuscleGroups | Tensor | Sequence[int],
         low: float | Tensor = -1.0,
         high: float | Tensor = 1.0,
         weight_scale: float = math.exp(0.5),
     ) -> None:
-        groups = groups if isinstance(groups, MuscleGroups) else MuscleGroups.of(groups)
-        self.groups = MuscleGroups(*(index.to(loc.device) for index in groups))
+        self.group, self.first, self.slot = group, first, slot
         self.low, self.high = (
-            torch.as_tensor(bound, dtype=loc.dtype, device=loc.device).expand(groups.num_muscles)
+            torch.as_tensor(bound, dtype=loc.dtype, device=loc.device).expand(group.shape[-1:])
             for bound in (low, high)
         )
-        first = self.groups.first
-        self.group_normal = TanhNormal(loc, scale, low=self.low[first], high=self.high[first])
+        self.center, self.half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        self.group_normal = TanhNormal(loc, scale)  # where bounds are ±1
         self.weight_loc, self.weight_scale, self.amplitude = weight_loc, weight_scale, amplitude
         super().__init__(loc.shape[:-1], self.low.shape, validate_args=False)
 
@@ -131,29 +131,48 @@ class GroupedTanhNormal(D.Distribution):
         """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too."""
         shared, log_prob = drawn(self.group_normal, sample_shape)
         noise = standard_normal(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
-        return self._spread(shared, self.weight_loc + self.weight_scale * noise), log_prob
+        action = self._spread(shared, self.weight_loc + self.weight_scale * noise)
+        return action, log_prob - self._log_half
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return self.group_normal.log_prob(value.index_select(-1, self.groups.first))
+        unit = picked((value - self.center) / self.half, self.first)
+        return self.group_normal.log_prob(unit) - self._log_half
 
     @property
     def deterministic_sample(self) -> Tensor:
         """The action [*, n] where all Gaussians are at their means."""
         return self._spread(self.group_normal.deterministic_sample, self.weight_loc)
 
+    @property
+    def _log_half(self) -> Tensor:
+        """How much wider than ±1 the bounds of the first members are [*]."""
+        return picked(self.half.log(), self.first).sum(-1)
+
     def _spread(self, shared: Tensor, weight: Tensor) -> Tensor:
-        """Actions [*, n] from the groups' [*, k] and v [*, n - k]."""
-        group, first, slot = self.groups
-        center, half = (self.high + self.low) / 2, (self.high - self.low) / 2
+        """Actions [*, n] from the groups' in ±1 [*, k] and v [*, n - k]."""
         change = (_DEVIATION * weight.tanh()).clamp(-self.amplitude, self.amplitude)
         change = torch.cat([change.new_zeros(*change.shape[:-1], 1), change], -1)
-        unit = (shared - center[first]) / half[first]
-        weighted = unit.index_select(-1, group) * (1 + change.index_select(-1, slot))
-        return (center + half * weighted).clamp(self.low, self.high)
+        change = picked(change, self.slot)
+        weighted = picked(shared, self.group) * (1 + change)
+        return (self.center + self.half * weighted).clamp(self.low, self.high)
+
+
+def picked(values: Tensor, index: Tensor) -> Tensor:
+    """The entries [*, k] of values [*, n] that an index [*, k] names; batch sizes may broadcast.
+
+    Examples:
+        >>> picked(torch.tensor([[5, 6], [7, 8]]), torch.tensor([1, 1, 0]))
+        tensor([[6, 6, 5],
+                [8, 8, 7]])
+    """
+    shape = torch.broadcast_shapes(values.shape[:-1], index.shape[:-1])
+    return values.expand(*shape, -1).gather(-1, index.expand(*shape, -1))
 
 
 class DynSynNetwork(nn.Module):
     """What a DynSyn actor computes: the parameters of :class:`GroupedTanhNormal`.
+
+    The groups are among them: actors that are updated side by side have each its own.
 
     Equation: amplitude(t) = clip(slope (t - start), 0, ceiling), with t in frames.
 
@@ -181,17 +200,20 @@ class DynSynNetwork(nn.Module):
         self.slope, self.start, self.ceiling = slope, start, ceiling
         # A buffer: the workers' amplitude then rises with the weights that they are sent.
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        for name, index in groups._asdict().items():
+            self.register_buffer(name, index, persistent=False)
 
     @property
     def amplitude(self) -> Tensor:
         """Largest deviation of a weight from 1, at this time []."""
         return (self.slope * (self.frames - self.start)).clamp(0, self.ceiling)
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        group, weight_loc = self.layers(*inputs).split(self.sizes, -1)
-        loc, scale = self.normal(group)
-        amplitude = self.amplitude.to(loc).expand(*loc.shape[:-1], 1)
-        return loc, scale, weight_loc, amplitude
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        shared, weight_loc = self.layers(*inputs).split(self.sizes, -1)
+        loc, scale = self.normal(shared)
+        amplitude = self.amplitude.to(loc).unsqueeze(-1)
+        fixed = (amplitude, self.group, self.first, self.slot)
+        return loc, scale, weight_loc, *(each.expand(*loc.shape[:-1], -1) for each in fixed)
 
 
 def make_dynsyn_actor(
@@ -230,7 +252,8 @@ def make_dynsyn_actor(
 
     Keys:
         reads ``inputs``; writes ``loc``, ``scale`` [*, k], ``weight_loc`` [*, n - k], ``amplitude``
-        [*, 1] and ``out_key`` [*, n] within the bounds.
+        [*, 1], ``group`` [*, n], ``first`` [*, k], ``slot`` [*, n] and ``out_key`` [*, n] within
+        the bounds.
 
     Raises:
         ValueError: if groups are not of n muscles or skip a number, or if slope is negative or
@@ -263,10 +286,8 @@ def make_dynsyn_actor(
     layers = make_layers(sum(inputs.values()), groups.num_groups + n, body, hidden, layer_norm)
     start_small(layers)
     network = DynSynNetwork(layers, groups, slope=slope, start=start, ceiling=ceiling)
-    parameters = ["loc", "scale", "weight_loc", "amplitude"]
-    return actor_with(
-        GroupedTanhNormal, network, inputs, parameters, action_spec, out_key, groups=groups
-    )
+    parameters = ["loc", "scale", "weight_loc", "amplitude", *MuscleGroups._fields]
+    return actor_with(GroupedTanhNormal, network, inputs, parameters, action_spec, out_key)
 
 
 def set_frames(actor: nn.Module, frames: int) -> None:

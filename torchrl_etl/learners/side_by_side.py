@@ -27,8 +27,8 @@ class SideBySide:
     of the learners; the pass is compiled if theirs are.
 
     Args:
-        learners (sequence of SACLearner): of equal sizes and settings; their bounds, statistics and
-            weights may differ.
+        learners (sequence of SACLearner): of equal sizes, bounds and settings; weights, statistics
+            and whatever else their modules hold as buffers may differ.
 
     Raises:
         ValueError: if there is no learner, or one has parameters of other shapes.
