@@ -265,8 +265,8 @@ def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
     [
         ([0, 1, 0], {}, "groups are of 3 muscles but the action has 6"),
         ([0, 1, 0, 3, 1, 0], {}, "every number from 0 to the largest"),
-        (GROUPS, {"slope": -1.0}, "may not fall"),
-        (GROUPS, {"ceiling": 0.2}, "deviate by 0.1 at most"),
+        (GROUPS, {"slope": -1.0}, "slope is -1"),
+        (GROUPS, {"ceiling": 0.2}, "ceiling is 0.2"),
     ],
 )
 def test_bad_input_is_refused_at_construction(groups: Any, options: Any, message: str) -> None:

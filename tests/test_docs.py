@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,12 @@ def test_the_clips_of_the_gallery_are_small(cards):
     sizes = {clip.name: clip.stat().st_size for clip in clips}
     assert sorted(sizes) == sorted(re.findall(r"tasks/([\w-]+\.webp)", "".join(cards)))
     assert max(sizes.values()) <= 80_000 and sum(sizes.values()) <= 1_000_000
+
+
+def test_the_table_of_layers_is_the_contract_on_imports():
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
+    layers = [layer.split(" | ") for layer in contract["contracts"][0]["layers"]]
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8").partition("## Layers")[2]
+    rows = re.findall(r"^\| (`.*?) \|", text.partition("\n\nDimensions")[0], re.MULTILINE)
+    named = [re.findall(r"`(\w+)`", row) for row in rows if "recipes/" not in row]
+    assert [{f"torchrl_etl.{name}" for name in row} for row in named] == [set(x) for x in layers]

@@ -189,6 +189,31 @@ def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_pa
         )
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("lattice +method.options.alpha=-1", "method.options.alpha is -1"),
+        ("lattice method.options.freq=0", "method.options.freq is 0"),
+        ("dynsyn method.options.ceiling=3", "method.options.ceiling is 3"),
+        ("dynsyn method.options.start_share=1.0", "method.options.start_share is 1.0"),
+        ("dynsyn method.options.group_share=2", "method.options.group_share is 2"),
+        ("eme method.options.tau=-1", "method.options.tau is -1"),
+        ("eme method.options.lr=0", "method.options.lr is 0"),
+        ("eme method.options.weight=-1", "method.options.weight is -1"),
+        ("dep method.options.kappa=0", "method.options.kappa is 0"),
+        ("sar method.options.blend=2", "method.options.blend is 2"),
+        ("sar method.options.percentile=200", "method.options.percentile is 200"),
+        ("sar method.options.num_synergies=0", "method.options.num_synergies is 0"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_named_in_full_before_the_run(setting, message, tmp_path):
+    method, override = setting.split()
+    with pytest.raises(ValueError) as caught:
+        Experiment(tiny(f"method={method}", ELBOW, f"run_dir='{tmp_path}/run'", override))
+    assert str(caught.value).startswith(message)
+    assert not (tmp_path / "run").exists()
+
+
 def controller(stage) -> DEPExploration:
     return next(m for m in stage.learner.behavior.modules() if isinstance(m, DEPExploration))
 

@@ -231,7 +231,7 @@ def test_a_tilde_is_the_home_folder(monkeypatch):
 def test_help_explains_the_settings(capsys):
     assert command("etl_sac.py", "--help") == 0
     said = capsys.readouterr().out
-    for word in ("stage", "synergies", "faithful", "experiment", "resume"):
+    for word in ("stage", "synergies", "faithful", "resume", "num_envs", "kl_weight", "epsilon"):
         assert word in said
 
 

@@ -60,7 +60,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("exploration.relabel=2", "exploration.relabel is 2; it must be a number in [0, 1]"),
         ("explore.fit.actions=loc", "policy, mean, sampled, activation"),
         ("learn.decoder.fine_tuning=freeze", "nearest: frozen"),
-        ("learn.decoder.residual=2", "residual is 2"),
+        ("learn.decoder.residual=2", "learn.decoder.residual is 2; it must be a number in [0, 1]"),
         ("learn.decoder.residual_std=0", "learn.decoder.residual_std is 0; it must be a number"),
         ("learn.decoder.residual_std=1 learn.decoder.residual=0", "learn.decoder.residual is 0"),
         ("explore.fit.final_updates=0.5", "explore.fit.final_updates is 0.5"),

@@ -24,7 +24,7 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     settings = ("learn.prefill=true", "learn.decoder.residual=0.5", "learn.reward_scale=3")
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings))
     experiment.run()
-    stage, (decoder, _) = experiment.method.stage(), experiment.method.decoder()
+    stage, decoder = experiment.method.stage(), experiment.method.decoder()
     stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
     rows = stage.buffer.storage[:]
     assert len(rows) == 600 + 608

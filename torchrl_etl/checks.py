@@ -101,9 +101,19 @@ def check_sizes(**values: object) -> None:
             raise ValueError(f"{name} is {value!r}; it must be a list of whole numbers above 0.")
 
 
+class _NamedInFull(ValueError):
+    """Says the full key already."""
+
+
 @contextmanager
-def naming(section: str) -> Iterator[None]:
+def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
     """Put the section of a configuration before what a check of an argument says.
+
+    Args:
+        section (str): its name, or the part of it that a caller's ``naming`` does not say.
+
+    Keyword Args:
+        in_full (bool): nothing is to go before it. Default: ``False``.
 
     Examples:
         >>> with naming("learn.sac"):
@@ -114,8 +124,11 @@ def naming(section: str) -> Iterator[None]:
     """
     try:
         yield
+    except _NamedInFull:
+        raise
     except ValueError as error:
-        raise type(error)(f"{section}.{error}") from error
+        kind = _NamedInFull if in_full else type(error)
+        raise kind(f"{section}.{error}") from error
 
 
 def check_flag(**values: object) -> None:

@@ -6,6 +6,7 @@ import difflib
 import logging
 import os
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import Any
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.extras import extra
-from torchrl_etl.training.config import RENAMED
+from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED
 from torchrl_etl.training.resumed import check_prefix, parse_override
 
 with extra("recipes"):
@@ -28,17 +29,6 @@ __all__ = [
     "quote_paths",
     "translate",
 ]
-
-
-# Sections whose keys are arguments of someone else's function.
-_OPEN = ("env_kwargs.", "logger_kwargs.", "ray.", "distributed.")
-
-# What stands for the defaults in a group of presets, now and before.
-_NO_PRESET = {
-    "learner": ("null", "residual"),
-    "experiment": ("null", "laptop"),
-    "faithful": ("null", "default"),
-}
 
 
 def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
@@ -56,7 +46,7 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
     text = config.read_text(encoding="utf-8")
     if {"-h", "--help"} & set(arguments):
         settings, _, _ = text.partition("\nhydra:")
-        print(usage.strip(), settings, sep="\n\n")
+        print(usage.strip(), settings, *_of_groups(config), sep="\n\n")
         sys.exit()
     known = list(_keys(OmegaConf.create(text)))
     defaults = OmegaConf.create(text).get("defaults", [])
@@ -80,7 +70,7 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
             continue
         if not separator and not argument.startswith("~"):
             sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
-        if key not in known and not key.startswith(_OPEN):
+        if key not in known and key.split(".")[0] not in OPEN_SECTIONS:
             near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
@@ -125,7 +115,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:
             key = "synergies.bundle"
-        elif value in _NO_PRESET.get(name, ()):
+        elif value in PRESETS.get(name, ()):
             continue
         translated.append(f"{key}{equals}{value}")
     return translated
@@ -184,6 +174,15 @@ def quiet_torchrl() -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.simplefilter("ignore", FutureWarning)
     warnings.formatwarning = lambda message, *place, **source: f"Warning: {message}\n"
+
+
+def _of_groups(config: Path) -> Iterator[str]:
+    """The settings of the files that the defaults choose, each as the section that it fills."""
+    for entry in OmegaConf.load(config).get("defaults", []):
+        for group, choice in entry.items() if isinstance(entry, DictConfig) else ():
+            if choice is not None and (file := config.parent / group / f"{choice}.yaml").is_file():
+                inner = textwrap.indent(file.read_text(encoding="utf-8").rstrip(), "  ")
+                yield f"{group}:   # {group}={choice}\n{inner}"
 
 
 def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -16,9 +16,7 @@ from torchrl.checkpoint import Checkpoint
 from torchrl_etl.checks import check_choice
 from torchrl_etl.collectors import start_resource_tracker
 from torchrl_etl.envs import resolve_task
-from torchrl_etl.io import surviving_folder
 from torchrl_etl.methods import METHODS
-from torchrl_etl.synergies.bundle import load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.context import Context
@@ -122,13 +120,6 @@ class Experiment:
         """The policy as it was before its first frame: weights that the run's seed draws, acting
         through the synergies that learning began with, if any."""
         return self.method.stage().learner.policy
-
-    def charged(self) -> int:
-        """Frames that went before learning: those that the run's own bundle tells of, if any."""
-        own = self.folder.synergies
-        if self.method.charged and surviving_folder(own).exists():
-            return load_bundle(own)[1].facts.get("frames", self.method.charged)
-        return self.method.charged
 
     def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
         """Evaluates the stage's present policy on the evaluation seeds."""

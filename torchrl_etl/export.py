@@ -74,7 +74,7 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
         policy=described,
         training={
             "method": config.method.name,
-            "frames": experiment.charged() + stage.frames,
+            "frames": experiment.method.frames_before() + stage.frames,
             "seed": config.seed,
             "commit": starts[-1].pop("commit", None),
             "versions": starts[-1],

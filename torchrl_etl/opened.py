@@ -14,9 +14,6 @@ from torchrl_etl import zoo
 from torchrl_etl.analysis.viewer import Subject
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.io import surviving_folder
-from torchrl_etl.methods.etl import ETL
-from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
@@ -123,18 +120,15 @@ def _with_policy(subject: Subject, experiment: Experiment) -> Subject:
     if _newest(experiment, "learn") is not None:
         learner = experiment.learned().learner
         return replace(subject, policy=learner.policy, decoder=learner.decoder)
-    method = experiment.method
-    if isinstance(method, ETL) and surviving_folder(method.bundle).exists():
-        return replace(subject, decoder=method.decoder()[0])
-    return subject
+    return replace(subject, decoder=experiment.method.decoder())
 
 
 def _with_explorer(subject: Subject, experiment: Experiment) -> Subject:
     """With stage 1's policy, if the run explored."""
     folder = _newest(experiment, "explore")
-    if folder is None or not isinstance(experiment.method, ETL):
+    explorer = None if folder is None else experiment.method.explorer()
+    if explorer is None:
         return subject
-    explorer = Explorer(experiment.context)
     policy = explorer.stage.learner.policy
     Checkpoint(policy=policy).load(folder)
     size = explorer.exploration.inputs.get("direction", 0)

@@ -13,6 +13,7 @@ from torch import distributions as D
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers, start_small
 from torchrl_etl.objectives.sac import drawn
@@ -278,11 +279,8 @@ def make_dynsyn_actor(
             f"groups are of {groups.num_muscles} muscles but the action has {n}; use groups that "
             "were found on this body."
         )
-    if slope < 0 or not 0 <= ceiling <= _DEVIATION:
-        raise ValueError(
-            f"slope is {slope} and ceiling is {ceiling}; the amplitude may not fall, and weights "
-            f"deviate by {_DEVIATION} at most."
-        )
+    check_real(f"[0, {_DEVIATION}]", ceiling=ceiling)
+    check_real("[0, inf)", slope=slope)
     layers = make_layers(sum(inputs.values()), groups.num_groups + n, body, hidden, layer_norm)
     start_small(layers)
     network = DynSynNetwork(layers, groups, slope=slope, start=start, ceiling=ceiling)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,13 @@ __all__ = ["group_muscles", "record_muscle_lengths"]
 
 
 def record_muscle_lengths(
-    env: EnvBase, frames: int, *, amplitude: float, every: int = 10, seed: int = 0
+    env: EnvBase,
+    frames: int,
+    *,
+    amplitude: float,
+    every: int = 10,
+    seed: int = 0,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Tensor:
     """Lengths of a body's actuators while its joints are thrown about.
 
@@ -43,6 +50,7 @@ def record_muscle_lengths(
             hands.
         every (int): steps between draws. Default: 10.
         seed (int): of the environment and the velocities. Default: 0.
+        on_step (callable): called before every step; may raise to stop.
 
     Returns:
         Tensor: [frames, n], in the simulator's units (metres, for muscles).
@@ -72,6 +80,7 @@ def record_muscle_lengths(
     lengths = np.empty((frames, model.nu), dtype=np.float32)
     held = _Held(model, state)
     for frame in range(frames):
+        on_step()
         if frame % every == 0:
             state.qvel[:] = amplitude * rng.uniform(-1, 1, model.nv)
         with held:

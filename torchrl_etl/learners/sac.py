@@ -296,7 +296,8 @@ def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
 def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
     """What is trained, each parameter once: a term's own at its learning rate, then SAC's."""
     groups, known = [], set()
-    for module, rate in (*((term.loss, term.lr or lr) for term in terms), (sac, lr)):
+    of_terms = ((term.loss, lr if term.lr is None else term.lr) for term in terms)
+    for module, rate in (*of_terms, (sac, lr)):
         fresh = [p for p in module.parameters() if p.requires_grad and id(p) not in known]
         known |= {id(parameter) for parameter in fresh}
         if fresh:

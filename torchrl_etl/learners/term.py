@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.objectives import FusedSoftUpdate
 
 __all__ = ["Term"]
@@ -29,7 +30,8 @@ class Term(nn.Module):
         inputs (callable, optional): makes what the loss reads out of a batch. Default: the batch.
 
     Raises:
-        ValueError: if the weight is negative.
+        ValueError: if the weight is negative, the learning rate is not positive, or tau is outside
+            (0, 1].
 
     Examples:
         >>> import torch
@@ -53,8 +55,11 @@ class Term(nn.Module):
         tau: float | None = None,
         inputs: Callable[[TensorDictBase], TensorDictBase] | None = None,
     ) -> None:
-        if not weight >= 0.0:
-            raise ValueError(f"weight is {weight}; a loss is minimized, so it must be 0 or more.")
+        check_real("[0, inf)", weight=weight)
+        if lr is not None:
+            check_real("(0, inf)", lr=lr)
+        if tau is not None:
+            check_real("(0, 1]", tau=tau)
         super().__init__()
         self.loss, self.weight, self.lr, self.inputs = loss, weight, lr, inputs
         self.target = None if tau is None else FusedSoftUpdate(loss, tau=tau)

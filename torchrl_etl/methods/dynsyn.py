@@ -15,6 +15,7 @@ from torchrl_etl.baselines import (
     record_muscle_lengths,
     set_frames,
 )
+from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.io import read_json, write_atomically
 from torchrl_etl.learners import entropy_target
 from torchrl_etl.methods.method import Method
@@ -42,11 +43,17 @@ class DynSyn(Method):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
-        options = dict(self.options)
-        self.charged = options.pop("frames")
-        self.amplitude = self.of_the_body(options.pop("amplitude"))
-        self.share = self.of_the_body(options.pop("group_share"))
-        self.actor_options = options
+        deviation = dict(self.options)
+        self.charged = deviation.pop("frames")
+        self.amplitude = self.of_the_body(deviation.pop("amplitude"))
+        self.share = self.of_the_body(deviation.pop("group_share"))
+        self.deviation = deviation
+        with naming("method.options"):
+            check_integer(1, frames=self.charged)
+            check_real("(0, inf)", amplitude=self.amplitude)
+            check_real("(0, 1]", group_share=self.share)
+            if "start_share" in deviation:
+                check_real("[0, 1)", start_share=deviation["start_share"])
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         yield from super().prepare(stop)
@@ -57,6 +64,7 @@ class DynSyn(Method):
                 self.charged,
                 amplitude=self.amplitude,
                 seed=2**30 + seed,
+                on_step=stop.check,
             )
             groups = group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed)
             write_atomically(self.file, json.dumps(groups.tolist()))
@@ -77,11 +85,13 @@ class DynSyn(Method):
         return {"kind": "dynsyn", "groups": self.groups}
 
     def stage(self) -> Stage:
-        groups, deviation = self.groups, dict(self.actor_options)
+        spec, groups, deviation = self.context.spec.action_spec, self.groups, dict(self.deviation)
         if "start_share" in deviation:
             frames = self.context.config.learn.frames
             start = deviation.pop("start_share") * frames
             deviation |= {"start": start, "slope": deviation["ceiling"] / (frames - start)}
+        with naming("method.options"):  # the actor checks them
+            make_dynsyn_actor({"observation": 1}, spec, groups, **deviation)
 
         def make_actor(inputs, spec, **options):
             return make_dynsyn_actor(inputs, spec, groups, **options, **deviation)

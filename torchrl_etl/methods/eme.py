@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
+from torchrl_etl.checks import naming
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.method import Method
 from torchrl_etl.modules import StateEncoder
@@ -31,16 +32,17 @@ class EME(Method):
         spec, options = self.context.spec, self.options
         sizes, device = (spec.observation_dim, spec.action_dim), spec.action_spec.device
         self.context.seed_everything("learn")
-        encoder = StateEncoder(sizes[0], options["embedding_dim"], hidden=options["hidden"])
-        ensemble = RewardEnsemble(*sizes, options["ensemble"], hidden=options["hidden"])
-        encoder, ensemble = encoder.to(device), ensemble.to(device)
+        with naming("method.options"):
+            encoder = StateEncoder(sizes[0], options["embedding_dim"], hidden=options["hidden"])
+            ensemble = RewardEnsemble(*sizes, options["ensemble"], hidden=options["hidden"])
+            scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
+            bonus = EMEBonus(encoder.to(device), ensemble.to(device), **scale)
 
         def more(actor):
             gamma = self.context.config.learn.sac.gamma
             loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
-            term = Term(loss, lr=options["lr"], tau=options["tau"])
+            with naming("method.options", in_full=True):
+                term = Term(loss, lr=options["lr"], tau=options["tau"])
             return {"terms": [term], "reward": "total_reward"}
 
-        scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
-        bonus = EMEBonus(encoder, ensemble, **scale)
         return self.context.stage(self.context.learner(more=more), transforms=[bonus], n_steps=1)

@@ -86,6 +86,8 @@ class ETL(Method):
                 f"stage=explore finds synergies, but synergies={config.synergies.bundle} was given;"
                 " leave it out or use stage=learn."
             )
+        with naming("learn.decoder"):
+            check_real("[0, 1]", residual=config.learn.decoder.residual)
         if self.given:
             # The absolute path stands in the run's configuration.
             config.synergies.bundle = str(bundle_path(config.synergies.bundle))
@@ -138,7 +140,7 @@ class ETL(Method):
             copy_bundle(self.bundle, self.context.folder.synergies)
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             yield from self._explore(stop)
-        _, info = self.decoder()
+        _, info = self._load()
         if not self.given:  # whole batches were collected, a few frames more than the budget
             self.charged = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
@@ -194,14 +196,27 @@ class ETL(Method):
 
     # Stage 2 -----------------------------------------------------------------------------------
 
-    def decoder(self) -> tuple[SynergyDecoder, BundleInfo]:
-        """The decoder that was given or explored, and what is known of it."""
+    def decoder(self) -> SynergyDecoder | None:
+        """The decoder that was given or explored, if it is there by now."""
+        if self.given or surviving_folder(self.context.folder.synergies).exists():
+            return self._load()[0]
+        return None
+
+    def explorer(self) -> Explorer:
+        return Explorer(self.context)
+
+    def frames_before(self) -> int:
+        own = self.context.folder.synergies
+        if not self.given and surviving_folder(own).exists():
+            return load_bundle(own)[1].facts["frames"]
+        return super().frames_before()
+
+    def _load(self) -> tuple[SynergyDecoder, BundleInfo]:
         return load_bundle(self.bundle, residual=self.context.config.learn.decoder.residual)
 
     def stage(self) -> Stage:
-        if self.given or surviving_folder(self.context.folder.synergies).exists():
-            return self.learn_stage(self.decoder()[0])
-        return self.learn_stage(self._placeholder())
+        decoder = self.decoder()
+        return self.learn_stage(self._placeholder() if decoder is None else decoder)
 
     def learn_stage(self, decoder: SynergyDecoder) -> Stage:
         """Stage 2 with this decoder, before its first frame."""

@@ -5,8 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+
 from torchrl_etl.baselines import LatticeNoise, make_lattice_actor
+from torchrl_etl.checks import naming
 from torchrl_etl.methods.method import Method
+from torchrl_etl.training.context import Context
 from torchrl_etl.training.stage import Stage
 
 __all__ = ["Lattice"]
@@ -21,16 +25,28 @@ class Lattice(Method):
 
     takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
 
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
+        self.actor_options = {k: v for k, v in self.options.items() if k != "freq"}
+        with naming("method.options"):  # each checks its own
+            actor = make_lattice_actor(
+                {"observation": 1}, context.spec.action_spec, **self.actor_options
+            )
+            self.behavior(actor)
+
     def actor(self) -> dict[str, Any]:
-        return {"kind": "lattice", **{k: v for k, v in self.options.items() if k != "freq"}}
+        return {"kind": "lattice", **self.actor_options}
+
+    def behavior(self, actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
+        """What collects: where the noise depends on the state, its matrices are held."""
+        if not self.options["state_dependent"]:
+            return actor
+        return LatticeNoise(actor, freq=self.options["freq"])
 
     def stage(self) -> Stage:
-        options = self.actor()
-        del options["kind"]
-        freq, held = self.options["freq"], options["state_dependent"]
         self.context.seed_everything("learn")
         learner = self.context.learner(
-            make_actor=partial(make_lattice_actor, **options),
-            make_behavior=partial(LatticeNoise, freq=freq) if held else lambda actor: actor,
+            make_actor=partial(make_lattice_actor, **self.actor_options),
+            make_behavior=self.behavior,
         )
         return self.context.stage(learner)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchrl_etl.envs import has_free_root
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.work import Work
+
+if TYPE_CHECKING:
+    from torchrl_etl.methods.explorer import Explorer
 
 __all__ = ["Method"]
 
@@ -76,6 +80,18 @@ class Method(ABC):
     def actor(self) -> dict[str, Any]:
         """The actor's kind, and arguments of its own, for :func:`~torchrl_etl.zoo.make_policy`."""
         return {"kind": "gaussian"}
+
+    def frames_before(self) -> int:
+        """Frames that :meth:`prepare` has taken, where it is done; else those that it will."""
+        return self.charged
+
+    def decoder(self) -> SynergyMap | None:
+        """What learning begins to act through, if that is known by now."""
+        return None
+
+    def explorer(self) -> Explorer | None:
+        """Stage 1, if the method has one."""
+        return None
 
     def check(self) -> None:
         """Build every part once, so that each objects to its arguments before the first frame."""

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_etl.baselines import SARDecoder, best_episodes
+from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
@@ -44,6 +45,11 @@ class SAR(Method):
         super().__init__(context)
         config = context.config
         self.rollout_frames, self.task = self.options["rollout_frames"], self.options["play_task"]
+        with naming("method.options"):
+            whole = ("frames", "rollout_frames", "num_synergies")
+            check_integer(1, **{name: self.options[name] for name in whole})
+            check_integer(0, preview_episodes=self.options["preview_episodes"])
+            check_real("[0, 100]", percentile=self.options["percentile"])
         self.charged = self.options["frames"] + self.rollout_frames
         self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
         self.blend = self.of_the_body(self.options["blend"])
@@ -109,7 +115,9 @@ class SAR(Method):
     def stage(self) -> Stage:
         spec = self.context.spec
         blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
-        decoder = SARDecoder(blank[0], blank[1:], low=spec.low, high=spec.high, blend=self.blend)
+        bounds = {"low": spec.low, "high": spec.high}
+        with naming("method.options"):
+            decoder = SARDecoder(blank[0], blank[1:], **bounds, blend=self.blend)
         if self.file.is_file():
             decoder.load_state_dict(load_file(self.file))
         self.context.seed_everything("learn")

@@ -22,14 +22,22 @@ from torchrl_etl.extras import extra
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["MAY_CHANGE", "RENAMED", "bfloat16_warning", "of_each_seed", "validate"]
+__all__ = [
+    "MAY_CHANGE",
+    "OPEN_SECTIONS",
+    "PRESETS",
+    "RENAMED",
+    "bfloat16_warning",
+    "of_each_seed",
+    "validate",
+]
 
 _LOGGERS = ("csv", "tensorboard", "wandb", "mlflow", "trackio")
 
 RENAMED = {
     "explore.updates_per_frame": "explore.replay_ratio",
     "explore.redraw": "exploration.relabel",
-    "explore.representation": "exploration=metra",
+    "explore.representation": "exploration",
     "explore.encoder": "exploration.encoder",
     "explore.encoder_lr": "exploration.lr",
     "explore.encoder_tau": "exploration.tau",
@@ -53,6 +61,16 @@ RENAMED = {
     "learn.sac.hold": "learn.noise",
 }
 """Settings by their names of before, and what they are called now."""
+
+OPEN_SECTIONS = ("env_kwargs", "logger_kwargs", "ray", "distributed")
+"""Sections whose keys are arguments of another library's function."""
+
+PRESETS = {
+    "learner": ("null", "residual"),
+    "experiment": ("null", "laptop"),
+    "faithful": ("null", "default"),
+}
+"""Groups of presets, with what stands for none of them, now and before."""
 
 MAY_CHANGE = (
     *(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_etl.extras import extra
-from torchrl_etl.training.config import MAY_CHANGE, RENAMED
+from torchrl_etl.training.config import MAY_CHANGE, OPEN_SECTIONS, PRESETS, RENAMED
 
 with extra("recipes"):
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -25,8 +25,6 @@ __all__ = ["check_prefix", "parse_override", "resumed_config"]
 _SECTIONS = ("explore", "learn", "checkpoint", "collector", "method")
 # Sections whose options are those of the kind that they name.
 _OF_A_KIND = ("exploration", "synergies")
-# Where settings of other libraries go, by names that are not ours.
-_OPEN_SECTIONS = ("logger_kwargs", "env_kwargs", "ray", "distributed")
 
 
 def resumed_config(
@@ -150,11 +148,10 @@ def _override(config: DictConfig, override: Override, newer: Container[str]) -> 
     parent = OmegaConf.select(config, section) if section else config
     known = isinstance(parent, DictConfig) and name in parent
     check_prefix(override, known)
-    presets = ("learner", "experiment", "faithful")
     if (
         not known
-        and key not in presets
-        and (not override.is_add() or key.split(".")[0] not in _OPEN_SECTIONS)
+        and key not in PRESETS
+        and (not override.is_add() or key.split(".")[0] not in OPEN_SECTIONS)
     ):
         near = get_close_matches(key, [f"{section}.{k}".lstrip(".") for k in parent or ()], n=1)
         hint = f"did you mean {near[0]}?" if near else "see its config.yaml."
