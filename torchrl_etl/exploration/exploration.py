@@ -46,7 +46,7 @@ class Exploration:
         return ()
 
     def relabel_transforms(self) -> Sequence[Transform]:
-        """For the buffer: they draw what the policy reads anew in each sampled batch."""
+        """For the buffer: they replace, in every sampled batch, what the policy reads."""
         return ()
 
     def batch_transforms(self) -> Sequence[Transform]:

@@ -16,6 +16,9 @@ class WarmedUpEMA(AveragedModel):
     ``ExponentialMovingAverage``, so that a short run does not show its untrained weights. Buffers
     are copied.
 
+    PyTorch's own ``update_parameters``, given the same average as ``multi_avg_fn``, comes to the
+    same numbers in several times the time, as it looks up and sorts all tensors at each call.
+
     Args:
         model (nn.Module): must keep its tensors, which are looked up once.
         decay (float): in [0, 1); 0 copies the weights.

@@ -31,7 +31,7 @@ class DecoderLoss(LossModule):
         its time, so on fresh pairs the gradient is zero and on stale ones it pulls back to old
         outputs; no reward reaches the decoder this way. As the sole fine-tuning signal it is the
         paper's literal reading; next to an actor loss that runs through the decoder it is the
-        anchor that keeps the synergies from drifting.
+        distillation term that keeps the synergies from drifting.
 
     Args:
         decoder (TensorDictModule): synergy → action; first in key and first out key are used.

@@ -69,11 +69,11 @@ class Context:
     @property
     def task(self) -> dict[str, Any]:
         """Arguments of :func:`~torchrl_etl.envs.make_env` that name the task."""
-        return {"name": self.config.env, **self.variant}
+        return {"name": self.config.env, **self.task_options}
 
     @property
-    def variant(self) -> dict[str, Any]:
-        """Those of them that make the task what it is."""
+    def task_options(self) -> dict[str, Any]:
+        """Those besides the name."""
         return {
             "goal": self.config.goal,
             "action_repeat": self.config.action_repeat,
@@ -148,7 +148,7 @@ class Context:
             task or self.config.env,
             num_envs=num_envs,
             transforms=tuple(env_transforms),
-            **{**self.variant, **other, **(env_options or {})},
+            **{**self.task_options, **other, **(env_options or {})},
         )
         configured = self.options(section)
         for key in NOT_OF_THE_STAGE:
@@ -181,11 +181,9 @@ class Context:
         }
         return run_stage(stage, self.folder, stop, **{**configured, **options})
 
-    def seed_everything(self, section: str) -> int:
-        """Seed PyTorch for what ``section`` builds; returns the seed."""
-        seed = stage_seed(self.config.seed, section)
-        torch.manual_seed(seed)
-        return seed
+    def seed_everything(self, section: str) -> None:
+        """Seed PyTorch for what ``section`` builds."""
+        torch.manual_seed(stage_seed(self.config.seed, section))
 
 
 def stage_seed(seed: int, section: str) -> int:

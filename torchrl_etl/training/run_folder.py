@@ -166,10 +166,10 @@ class RunFolder:
     def _logger(self, name: str) -> Logger:
         if name == "tensorboard":
             return _ResumableTensorboard(str(self.path), self._purge_step)
-        extra = {} if name == "csv" else self._own(name)
-        extra |= self._config.get("logger_kwargs", {}).get(name, {})
+        options = {} if name == "csv" else self._own(name)
+        options |= self._config.get("logger_kwargs", {}).get(name, {})
         title = name if name == "csv" else self.path.name
-        return get_logger(name, str(self.path), title, **{f"{name}_kwargs": extra})
+        return get_logger(name, str(self.path), title, **{f"{name}_kwargs": options})
 
     def _own(self, name: str) -> dict[str, Any]:
         """What tells this run from others in a logger's own list of them."""
