@@ -44,7 +44,6 @@ def main() -> None:
         arguments.out / "synergies",
         task=info.task,
         actuators=info.actuators,
-        num_components=info.num_components,
         kind=info.kind,
         facts=dict(info.facts) | {"shuffled": places.tolist()},
     )

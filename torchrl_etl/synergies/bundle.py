@@ -50,7 +50,6 @@ def save_bundle(
     task: str,
     actuators: Sequence[str],
     facts: Mapping[str, Any] | None = None,
-    num_components: int | None = None,
     kind: str | None = None,
 ) -> Path:
     """Write a decoder and its description to the folder ``path``, whole or not at all.
@@ -70,8 +69,6 @@ def save_bundle(
         actuators (sequence of str): names of the n actuators, in action order.
         facts (mapping, optional): anything JSON can hold; scalars of torch and numpy and paths are
             converted, numbers that are not finite become null.
-        num_components (int, optional): mixture components of the GMVAE it came from. Default: those
-            of its encoder.
         kind (str, optional): kind of synergies. Default: ``"affine"`` for a decoder without hidden
             layers, else ``"gmvae"``.
 
@@ -103,7 +100,6 @@ def save_bundle(
     state, encoder = decoder.state_dict(), decoder.encoder
     if encoder is not None:
         state |= {f"{_ENCODER}{key}": value for key, value in encoder.state_dict().items()}
-        num_components = encoder.num_components if num_components is None else num_components
     if (bad := not_finite(state)) is not None:
         raise BundleError(
             f"{bad} of the decoder is not finite, so it has no synergies to save; its training "
@@ -122,7 +118,6 @@ def save_bundle(
         residual=float(config.get("residual", 0.0)),
         config=config,
         sha256=hashlib.sha256(tensors).hexdigest(),
-        num_components=num_components,
         facts=_plain(dict(facts or {}), "facts"),
         kind=default_kind(decoder.is_affine) if kind is None else kind,
         encoder=None if encoder is None else encoder.config,

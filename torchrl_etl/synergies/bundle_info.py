@@ -46,7 +46,6 @@ class BundleInfo:
         residual (float): residual share of the decoder.
         config (dict): constructor arguments of the decoder.
         sha256 (str): digest of the tensors file.
-        num_components (int, optional): mixture components of the GMVAE it came from.
         facts (dict): frames, seed, commit, versions, variance accounted for, and the like.
         kind (str): kind of synergies, such as ``"gmvae"`` or ``"nmf"``.
         encoder (dict, optional): constructor arguments of the encoder, if there is one.
@@ -61,7 +60,6 @@ class BundleInfo:
     residual: float
     config: dict[str, Any]
     sha256: str
-    num_components: int | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     kind: str = "gmvae"
     encoder: dict[str, Any] | None = None
@@ -84,6 +82,7 @@ def read_description(folder: Path) -> BundleInfo:
             f"{path} has format version {version!r} and this torchrl_etl reads 1 and "
             f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
         )
+    content.pop("num_components", None)  # earlier bundles repeat the encoder's
     known = {item.name for item in fields(BundleInfo)}
     if version == 1:
         content = {"kind": "", "encoder": None, **content}
