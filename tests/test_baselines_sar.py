@@ -217,13 +217,11 @@ def test_actions_that_cannot_be_fitted_are_refused() -> None:
     actions, *_ = planted()
     with pytest.raises(ValueError, match="vary in 3 dimensions are too few for 4 synergies"):
         SARDecoder.fit(actions, 4)
-    with pytest.raises(ValueError, match="2 actions that vary in 1 dimensions"):
+    with pytest.raises(ValueError, match=r"have 2 row.*at least 3 different actions"):
         SARDecoder.fit(actions[:2], 2)
-    with pytest.raises(ValueError, match=r"beyond the bounds low=0 and high=1.*action units"):
+    with pytest.raises(ValueError, match=r"the bounds are \[0, 1\]; bring the actions to these"):
         SARDecoder.fit(actions, 3, low=0.0, high=1.0)
-    with pytest.raises(ValueError, match=r"must be finite floating point numbers"):
-        SARDecoder.fit(actions.view(5, 100, MUSCLES), 3)
-    with pytest.raises(ValueError, match=r"must be finite floating point numbers"):
+    with pytest.raises(ValueError, match="NaN or infinity"):
         SARDecoder.fit(torch.where(actions > 0.3, torch.nan, actions), 3)
     with pytest.raises(ValueError, match=r"num_synergies is 0"):
         SARDecoder.fit(actions, 0)

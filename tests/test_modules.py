@@ -196,7 +196,7 @@ def test_state_encoder_is_blind_to_the_units_of_the_whole_observation() -> None:
 def test_state_encoder_refuses_impossible_sizes() -> None:
     with pytest.raises(ValueError, match="embedding_dim is 0"):
         StateEncoder(5, 0)
-    with pytest.raises(ValueError, match="hidden is empty"):
+    with pytest.raises(ValueError, match=r"hidden is \(\)"):
         StateEncoder(5, 3, hidden=())
 
 

@@ -146,7 +146,7 @@ def test_other_transforms_may_follow():
     ("arguments", "message"),
     [
         ({"embedding_dim": 0}, "embedding_dim is 0"),
-        ({"embedding_dim": 2, "kind": "spheer"}, "'spheer'.*'sphere' or 'orthonormal'"),
+        ({"embedding_dim": 2, "kind": "spheer"}, "'spheer'.*nearest: sphere"),
         ({"embedding_dim": 2, "num_directions": 2}, "sphere has no finite set"),
         ({"embedding_dim": 2, "kind": "orthonormal", "num_directions": 3}, "is 3, but only 2"),
     ],

@@ -18,7 +18,7 @@ from torchrl_etl.synergies.sar import independent_components
 __all__ = ["SARDecoder", "best_episodes"]
 
 
-class _AffineSynergies(nn.Module):
+class _BlendedBasis(nn.Module):
     """z ∈ [-1, 1]^d → mean + z·basis, blended with a raw action, in the bounds."""
 
     def __init__(
@@ -103,7 +103,7 @@ class SARDecoder(SynergyMap):
         _check_blend(blend)
         low, high = _bounds(low, high, mean)
         super().__init__(
-            _AffineSynergies(mean.detach().clone(), basis.detach().clone(), low, high, blend),
+            _BlendedBasis(mean.detach().clone(), basis.detach().clone(), low, high, blend),
             in_keys=list(in_keys),
             out_keys=list(out_keys),
         )
@@ -144,12 +144,13 @@ class SARDecoder(SynergyMap):
             SARDecoder: in the dtype and on the device of the actions.
 
         Raises:
-            ValueError: if there are too few actions or dimensions in which they vary, or they are
-                outside the bounds.
+            ValueError: if there are too few actions or dimensions in which they vary, or they do
+                not fit (see :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
         """
         _check_blend(blend)
-        _check_actions(actions, num_synergies, low, high)
-        rows = actions.detach().cpu().double().numpy()
+        check_integer(1, num_synergies=num_synergies)
+        actions = _varying(actions, num_synergies, low, high)
+        rows = actions.cpu().double().numpy()
         mean, basis = map(torch.as_tensor, independent_components(rows, num_synergies, seed=seed))
         coefficients = (torch.as_tensor(rows) - mean) @ basis.pinverse()
         least, most = coefficients.aminmax(dim=0)
@@ -275,26 +276,17 @@ def _bounds(low: Any, high: Any, mean: Tensor) -> tuple[Tensor, Tensor]:
     return low.to(mean), high.to(mean)
 
 
-def _check_actions(actions: Tensor, num_synergies: int, low: Any, high: Any) -> None:
-    check_integer(1, num_synergies=num_synergies)
-    is_real = actions.is_floating_point() and actions.isfinite().all()
-    if actions.ndim != 2 or not len(actions) or not is_real:
-        raise ValueError(
-            f"actions are {actions.dtype} of shape {list(actions.shape)}; they must be finite "
-            "floating point numbers [N, actuators]."
-        )
-    low, high = _bounds(low, high, actions[0])
-    if (actions < low - 1e-4).any() or (actions > high + 1e-4).any():
-        raise ValueError(
-            f"actions span [{actions.min():g}, {actions.max():g}], beyond the bounds low="
-            f"{low.min():g} and high={high.max():g}; give them in action units, as the entry "
-            "'activation' of make_env(..., activations=True) is."
-        )
-    centered = actions.detach().double() - actions.detach().double().mean(0)
+def _varying(actions: Tensor, num_synergies: int, low: Any, high: Any) -> Tensor:
+    """The actions [N, n], if so many synergies can be found in them."""
+    real = torch.promote_types(actions.dtype, torch.float32)
+    low, high = _bounds(low, high, actions.new_zeros(actions.shape[-1:], dtype=real))
+    actions = as_actions(actions, low=low, high=high, min_rows=num_synergies + 1)
+    centered = actions.double() - actions.double().mean(0)
     variances = torch.linalg.eigvalsh(centered.T @ centered)
     varying = int((variances > 1e-10 * variances.max()).sum())
-    if len(actions) <= num_synergies or varying < num_synergies:
+    if varying < num_synergies:
         raise ValueError(
             f"{len(actions)} actions that vary in {varying} dimensions are too few for "
             f"{num_synergies} synergies; collect more, or ask for fewer."
         )
+    return actions

@@ -9,7 +9,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_integer, check_sizes
 
 __all__ = ["GaussianDynamics", "StateEncoder"]
 
@@ -42,7 +42,7 @@ class StateEncoder(TensorDictModule):
         the dtype of the weights.
 
     Raises:
-        ValueError: if a size is not positive or ``hidden`` is empty.
+        ValueError: if a size or width is not positive, or ``hidden`` is empty.
 
     Examples:
         >>> import torch
@@ -64,10 +64,7 @@ class StateEncoder(TensorDictModule):
         out_keys: Sequence[NestedKey] = ("embedding",),
     ) -> None:
         check_integer(1, observation_dim=observation_dim, embedding_dim=embedding_dim)
-        if not hidden:
-            raise ValueError(
-                "hidden is empty; give at least one width, for the layer that is normalized."
-            )
+        check_sizes(hidden=hidden)
         first, *rest = hidden
         network = _Network(
             nn.Linear(observation_dim, first),

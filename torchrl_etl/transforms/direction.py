@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.transforms.keys import (
     group_reset,
     group_shape,
@@ -87,8 +87,7 @@ class DirectionPrimer(TensorDictPrimer):
         out_key: NestedKey = "direction",
     ) -> None:
         check_integer(1, embedding_dim=embedding_dim)
-        if kind not in ("sphere", "orthonormal"):
-            raise ValueError(f"kind is {kind!r}; choose 'sphere' or 'orthonormal'.")
+        check_choice("kind", kind, ("sphere", "orthonormal"))
         if kind == "sphere" and num_directions is not None:
             raise ValueError(
                 f"num_directions is {num_directions}, but a sphere has no finite set of "
