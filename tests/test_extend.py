@@ -8,19 +8,69 @@ import sys
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.objectives import LossModule
 
 from tests.configs import CONF, ROOT, tiny
 from tests.stages import changed, goes_on_after_a_load, snapshot
+from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.synergies import fit_synergies, load_bundle
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
 
 PAGE = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```$", PAGE, re.S | re.M))
 MODULES = ("curiosity", "at_random", "recordings")
 BRIEF = ("explore.frames=192", "learn.frames=64", "evaluation.episodes=1")
 OWN = ("exploration=curiosity", "synergies=random")
+
+
+class Rebuilt(LossModule):
+    """Squared error of actions [B, n] that are rebuilt from d coefficients."""
+
+    def __init__(self, n, d):
+        super().__init__()
+        self.basis = nn.Parameter(torch.randn(d, n) / n)
+
+    def rebuild(self, actions):
+        return actions @ self.basis.mT @ self.basis
+
+    def forward(self, batch):
+        error = (self.rebuild(batch["action"]) - batch["action"]).square().mean()
+        return TensorDict({"loss_rebuilt": error})
+
+
+class Learned(SynergyModel):
+    """A model with a loss, which has what the page's table asks for and no more."""
+
+    kind = "learned"
+
+    def __init__(self, low, high, num_synergies):
+        self.num_synergies, self.bounds = num_synergies, {"low": low, "high": high}
+        self.loss = Rebuilt(len(low), num_synergies)
+
+    def fit(self, actions, *, on_update=lambda: None):
+        self.loss.basis.data = torch.linalg.svd(actions).Vh[: self.num_synergies]
+
+    def decoder(self, actions, *, residual=0.0):
+        bounds = {key: bound.tolist() for key, bound in self.bounds.items()}
+        directions = self.loss.basis.detach()
+        return SynergyDecoder.from_directions(
+            actions.mean(0), directions, **bounds, residual=residual
+        )
+
+    def reconstruct(self, actions):
+        return self.loss.rebuild(actions)
+
+
+class NoBundle(Learned):
+    """Its decoder is another class."""
+
+    def decoder(self, actions, *, residual=0.0):
+        return SARDecoder(actions.mean(0), self.loss.basis.detach(), **self.bounds)
 
 
 @pytest.fixture
@@ -52,6 +102,27 @@ def test_both_stages_run_with_the_toys(conf, tmp_path):
     summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings, conf=conf)).run()
     assert summary["learn"]["frames"] == 64
     assert load_bundle(tmp_path / "run")[1].kind == "random"
+
+
+def of_this_file(kind, tmp_path):
+    """A run with a synergy model of this file: pca's section has no options of its own."""
+    own = ("synergies=pca", f"synergies.kind=tests.test_extend:{kind}", *BRIEF)
+    return tiny(f"run_dir='{tmp_path}/run'", *own, "pictures=true", "vaf_curve.dims=[1]")
+
+
+def test_a_model_with_a_loss_goes_through_both_stages_with_its_pictures(tmp_path):
+    summary = Experiment(of_this_file("Learned", tmp_path)).run()
+    assert summary["learn"]["frames"] == 64
+    assert load_bundle(tmp_path / "run")[1].kind == "learned"
+    drawn = {file.name for file in (tmp_path / "run" / "pictures").iterdir()}
+    assert drawn >= {"synergies.png", "vaf.png", "embedding.png"}
+
+
+def test_a_model_whose_decoder_no_bundle_holds_is_refused_before_stage_1(tmp_path):
+    words = "NoBundle, whose decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
+    with pytest.raises(ValueError, match=words):
+        Experiment(of_this_file("NoBundle", tmp_path))
+    assert not (tmp_path / "run").exists()
 
 
 def test_stage_1_of_the_toys_goes_on_after_a_kill_with_the_same_numbers(conf, tmp_path):

@@ -146,6 +146,23 @@ def test_a_muscle_that_rests_stays_at_rest_in_nmf() -> None:
     assert moved.isfinite().all()
 
 
+def test_a_fit_of_a_gmvae_begins_anew_and_heeds_the_weights_of_its_loss() -> None:
+    actions, bounds = activity(), (torch.zeros(6), torch.ones(6))
+
+    def rebuilt(model: SynergyModel) -> Tensor:
+        torch.manual_seed(1)
+        model.fit(actions)
+        return model.reconstruct(actions)
+
+    for weight in ("kl_weight", "component_kl_weight"):
+        plain, other = (
+            SYNERGY_MODELS["gmvae"](*bounds, 2, **FEW["gmvae"], **{weight: w}) for w in (1, 9)
+        )
+        first = rebuilt(plain)
+        assert torch.equal(rebuilt(plain), first)
+        assert not torch.equal(rebuilt(other), first)
+
+
 def test_a_vae_is_a_gmvae_of_one_component_to_the_bit() -> None:
     actions = activity()
     torch.manual_seed(1)
@@ -246,7 +263,8 @@ def test_a_bundle_of_every_kind_encodes_and_decodes_as_what_was_saved(kind: str,
     save_bundle(decoder, tmp_path / "b", task="toy", actuators=list("abcdef"), kind=kind)
     copy, info = load_bundle(tmp_path / "b")
     assert info.kind == kind and info.format_version == 2
-    assert info.num_components == {"gmvae": 2, "vae": 1}.get(kind)
+    components = None if info.encoder is None else info.encoder["num_components"]
+    assert components == {"gmvae": 2, "vae": 1}.get(kind)
     synergy = 2 * torch.rand(20, 8) - 1
     assert torch.equal(copy(synergy), decoder(synergy))
     assert torch.equal(copy.encode(actions), decoder.encode(actions))

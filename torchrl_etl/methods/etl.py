@@ -23,6 +23,7 @@ from torchrl_etl.modules import SynergyDecoder, make_actor
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import (
     BundleInfo,
+    SynergyModel,
     check_compatible,
     copy_bundle,
     load_bundle,
@@ -118,7 +119,21 @@ class ETL(Method):
             explorer = Explorer(self.context)
             if explorer.shown.actions == "activation":
                 self.context.make_env(activations=True).close()
+            self._try_out(explorer.model)
         self.stage()
+
+    def _try_out(self, model: SynergyModel) -> None:
+        """Refuse a model whose decoder no bundle can hold: stage 1 takes hours to find out."""
+        actions = self.context.spec.action_spec.rand((256,))
+        if model.loss is None:
+            model.fit(actions)
+        decoder = model.decoder(actions)
+        if not isinstance(decoder, SynergyDecoder):
+            raise ValueError(
+                f"synergies.kind is {self.context.config.synergies.kind}, whose decoder is a "
+                f"{type(decoder).__name__}; bundles and stage 2 need a SynergyDecoder, such as "
+                "SynergyDecoder.from_directions makes."
+            )
 
     # Stage 1 -----------------------------------------------------------------------------------
 
@@ -176,12 +191,16 @@ class ETL(Method):
         from torchrl_etl.analysis import draw_synergies, embedding
 
         context, curve = self.context, self.context.options("vaf_curve")
-        folder, updates = context.folder.pictures, {"updates": curve.pop("updates")}
-        if explorer.model.loss is None:  # it is fitted in one go
-            updates = {}
+        folder, updates = context.folder.pictures, curve.pop("updates")
+
+        def make_model(d: int) -> SynergyModel:
+            model = make_synergy_model(context, d)
+            model.updates = updates
+            return model
+
         try:
             draw_synergies(
-                lambda d: make_synergy_model(context, d, **updates),
+                make_model,
                 decoder,
                 explorer.actions(),
                 context.spec.actuators,

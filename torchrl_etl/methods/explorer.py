@@ -135,19 +135,14 @@ def make_exploration(context: Context) -> Exploration:
     return _make("exploration", EXPLORATIONS, Exploration, (context.spec,), **options)
 
 
-def make_synergy_model(
-    context: Context, num_synergies: int | None = None, **options: Any
-) -> SynergyModel:
+def make_synergy_model(context: Context, num_synergies: int | None = None) -> SynergyModel:
     """The synergy model that the configuration names.
 
     Args:
         context (Context): of the run.
         num_synergies (int, optional): d. Default: the configured one.
-
-    Keyword Args:
-        **options: in place of configured ones.
     """
-    options = {**context.options("synergies"), **options}
+    options = context.options("synergies")
     options.pop("bundle", None)
     number = context.config.num_synergies if num_synergies is None else num_synergies
     inputs = (context.spec.low, context.spec.high, number)

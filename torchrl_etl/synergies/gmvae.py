@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_etl.checks import check_real, check_sizes
+from torchrl_etl.checks import check_integer, check_real, check_sizes
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.objectives import GMVAELoss
@@ -51,7 +51,8 @@ class GMVAESynergies(SynergyModel):
         check_real("(0, inf)", lr=lr)
         check_real("[0, inf)", kl_weight=kl_weight, component_kl_weight=component_kl_weight)
         check_sizes(hidden=hidden)
-        self.num_synergies, self.lr, self._updates = num_synergies, lr, updates
+        check_integer(1, updates=updates)
+        self.num_synergies, self.lr, self.updates = num_synergies, lr, updates
         self.model = GMVAE(
             len(low),
             num_synergies,
@@ -65,7 +66,9 @@ class GMVAESynergies(SynergyModel):
         )
 
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
-        fit_gmvae(self.model, actions, updates=self._updates, lr=self.lr, on_update=on_update)
+        self.loss.reset_parameters_recursive()
+        options = {"updates": self.updates, "lr": self.lr, "on_update": on_update}
+        fit_gmvae(self.model, actions, loss=self.loss, **options)
 
     def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
         return SynergyDecoder.from_gmvae(self.model, actions, residual=residual)
@@ -81,6 +84,7 @@ def fit_gmvae(
     updates: int,
     batch_size: int = 256,
     lr: float = 3e-3,
+    loss: GMVAELoss | None = None,
     on_update: Callable[[], None] = lambda: None,
 ) -> GMVAE:
     """Train a GMVAE on an array of actions [N, n] by Eq. 9; returns it.
@@ -92,6 +96,7 @@ def fit_gmvae(
 
     Keyword Args:
         updates, batch_size (int), lr (float): of Adam.
+        loss (GMVAELoss, optional): of this GMVAE. Default: one with both weights at 1.
         on_update (callable): called before every update; may raise to stop.
 
     Raises:
@@ -109,7 +114,7 @@ def fit_gmvae(
         True
     """
     actions = as_actions(actions, low=gmvae.low, high=gmvae.high, min_rows=2)
-    loss = GMVAELoss(gmvae)
+    loss = GMVAELoss(gmvae) if loss is None else loss
     optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
     for _ in range(updates):
         on_update()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_etl.modules import SynergyMap
+from torchrl_etl.modules import SynergyDecoder
 
 __all__ = ["SynergyModel"]
 
@@ -25,12 +25,14 @@ class SynergyModel(ABC):
         loss (LossModule, optional): trained beside stage 1 on entry ``action``; ``None`` for a
             model that is fitted once, when all actions are known.
         lr (float): learning rate of the loss.
+        updates (int): of :meth:`fit`, where it trains; the picture of VAF sets it for its models.
     """
 
     kind: ClassVar[str]
     num_synergies: int
     loss: LossModule | None = None
     lr: float = 1e-3
+    updates: int = 2000
 
     @abstractmethod
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
@@ -41,13 +43,9 @@ class SynergyModel(ABC):
         """
 
     @abstractmethod
-    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyMap:
+    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
         """The map from coefficients in [-1, 1]^d to actions, which spans ``actions`` [N, n]."""
 
     @abstractmethod
     def reconstruct(self, actions: Tensor) -> Tensor:
-        """Actions [*, n] as d coefficients can tell them."""
-
-    def describe(self, actions: Tensor) -> dict[str, Any]:
-        """Facts that only this kind has, for the bundle."""
-        return {}
+        """Actions [*, n] rebuilt from their d coefficients."""
