@@ -139,11 +139,11 @@ def test_workers_end_at_once_and_the_group_is_gone(start):
 
 def test_bad_arguments_are_named_before_anything_is_started():
     policy = synergy_policy()
-    with pytest.raises(ValueError, match="launcher must be 'mp' or 'submitit', got 'slurm'"):
+    with pytest.raises(ValueError, match="launcher is 'slurm'; choose one of mp, submitit"):
         DistributedWorkers(
             make_batched_env, policy, num_workers=1, frames_per_batch=8, launcher="slurm"
         )
-    with pytest.raises(ValueError, match="num_workers must be a positive integer"):
+    with pytest.raises(ValueError, match="num_workers is 0; it must be a whole number, 1"):
         DistributedWorkers(make_batched_env, policy, num_workers=0, frames_per_batch=8)
     with pytest.raises(OSError, match="no such model"):  # its own error, not a worker's silence
 

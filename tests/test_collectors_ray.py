@@ -175,11 +175,11 @@ def test_a_local_ray_is_started_without_an_address_and_ended_with_the_collector(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"num_workers": 0}, "num_workers must be a positive integer, got 0"),
-        ({"frames_per_batch": -8}, "frames_per_batch must be a positive integer, got -8"),
+        ({"num_workers": 0}, "num_workers is 0; it must be a whole number, 1"),
+        ({"frames_per_batch": -8}, "frames_per_batch is -8; it must be a whole number, 1"),
         ({"frames_per_batch": 15, "sync": True}, "num_workers=2; a multiple of it near by is 16"),
-        ({"timeout": 0}, "timeout must be a positive number"),
-        ({"replacements": -1}, "replacements must be an integer of at least 0"),
+        ({"timeout": 0}, "timeout is 0; it must be a number above 0"),
+        ({"replacements": -1}, "replacements is -1; it must be a whole number, 0"),
         ({"collector_class": "async"}, "must be torchrl.collectors.Collector or a subclass"),
         ({"collector_kwargs": {"policy": None}}, "collector_kwargs may not hold policy"),
         ({"policy": torch.nn.Linear(6, 16)}, "policy is a Linear"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from torchrl.collectors.distributed import DistributedCollector, generic
 from torchrl.envs import EnvBase
 from torchrl.weight_update import DistributedWeightSyncScheme
 
+from torchrl_etl.checks import check_choice
 from torchrl_etl.collectors.remote import (
     RemoteWorkers,
     check_arguments,
@@ -98,7 +99,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         collector_kwargs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        collector_kwargs = dict(collector_kwargs or {})
+        collector_kwargs = {"auto_register_policy_transforms": False, **(collector_kwargs or {})}
         check_arguments(
             create_env_fn,
             policy,
@@ -109,50 +110,42 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             collector_class=collector_class,
             collector_kwargs=collector_kwargs,
         )
-        if launcher not in ("mp", "submitit"):
-            raise ValueError(f"launcher must be 'mp' or 'submitit', got {launcher!r}.")
-        if launcher == "submitit" and not generic._has_submitit:
-            raise ImportError(
-                "launcher='submitit' needs submitit: pip install 'torchrl_etl[slurm]'."
-            )
-        if torch.distributed.is_initialized():
-            raise RuntimeError(
-                "DistributedWorkers needs torch's default process group for itself, and there is "
-                "one already in this process. Use RayWorkers, or destroy_process_group() first."
-            )
-        self.timeout, self._trackers, self._asked = timeout, {}, {}
-        own_policy = cpu_copy(policy)
-        collector_kwargs = {"auto_register_policy_transforms": False, **collector_kwargs}
+        _check_launcher(launcher)
         share = frames_per_batch // num_workers if sync else frames_per_batch
-        # In the place of a batch that TorchRL 0.14.1 collects when the workers run already, and by
-        # the base class Collector, whose batches may have other entries than collector_class's.
-        self._example = _one_batch(
-            collector_class,
-            create_env_fn,
-            own_policy,
-            frames_per_batch=share,
-            **collector_kwargs,
-        )
-        scheme = DistributedWeightSyncScheme()
+        work = {"frames_per_batch": share, "collector_class": collector_class}
+        own_policy = cpu_copy(policy)
+        self._example = _one_batch(create_env_fn, own_policy, **work, **collector_kwargs)
+        self.launcher, self.timeout = launcher, timeout
+        self._trackers, self._asked = {}, {}
+        with self._starting(seed):
+            super().__init__(
+                [create_env_fn] * num_workers,
+                own_policy,
+                **work,
+                sync=False,  # the one protocol of TorchRL's whose answers can be polled
+                launcher=launcher,
+                tcp_port=tcp_port or _free_port(),
+                collector_kwargs=collector_kwargs,
+                weight_sync_schemes={"policy": DistributedWeightSyncScheme()},
+                **kwargs,
+            )
+        self.policy, self.frames_per_batch = policy, frames_per_batch
+        self._prepare(policy, sync, total_frames, timeout)
+        self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has sent the weights
+
+    # Workers ---------------------------------------------------------------------------------
+
+    @contextmanager
+    def _starting(self, seed: int) -> Iterator[None]:
+        """Around TorchRL's constructor: seeds its workers, limits its waits, ends what fails."""
         # TorchRL 0.14.1 takes its limit for all waits of the process group, 1000, in days; and its
         # set_seed ends the workers, so that their main function has to seed them.
-        days, main = timeout / 86_400, partial(_seeded_main, seed)
+        days, main = self.timeout / 86_400, partial(_seeded_main, seed)
         mended = {"MAX_TIME_TO_CONNECT": days, "_distributed_init_collection_node": main}
-        self.launcher, self.jobs, self._weight_sync_schemes = launcher, [], None
+        self.jobs, self._weight_sync_schemes = [], None
         try:
             with patch.multiple(generic, **mended):
-                super().__init__(
-                    [create_env_fn] * num_workers,
-                    own_policy,
-                    frames_per_batch=share,
-                    sync=False,  # the one protocol of TorchRL's whose answers can be polled
-                    launcher=launcher,
-                    tcp_port=tcp_port or _free_port(),
-                    collector_class=collector_class,
-                    collector_kwargs=collector_kwargs,
-                    weight_sync_schemes={"policy": scheme},
-                    **kwargs,
-                )
+                yield
         except BaseException as error:
             dead = self._dead()
             self.shutdown()
@@ -160,14 +153,11 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
                 raise
             who = f"worker {dead[0]} ended while it started" if dead else "workers did not start"
             raise RuntimeError(
-                f"DistributedWorkers: {who} (limit {timeout:g} s; its own message is in its "
+                f"DistributedWorkers: {who} (limit {self.timeout:g} s; its own message is in its "
                 f"output). {error}"
             ) from error
-        for store in (self._store, scheme._store):  # the workers' own ends wait for longer
-            store.set_timeout(timedelta(seconds=timeout))
-        self.policy, self.frames_per_batch = policy, frames_per_batch
-        self._prepare(policy, sync, total_frames, timeout)
-        self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has sent the weights
+        for store in (self._store, self._weight_sync_schemes["policy"]._store):
+            store.set_timeout(timedelta(seconds=self.timeout))  # the workers' own wait for longer
 
     def _make_container(self) -> None:
         self._tensordict_out = [self._example.clone().lock_() for _ in range(self.num_workers)]
@@ -260,7 +250,29 @@ def _seeded_main(seed: int, **kwargs: Any) -> None:
     _main(**kwargs)
 
 
-def _one_batch(collector_class: type[Collector], create_env_fn, policy, **kwargs) -> TensorDictBase:
+def _check_launcher(launcher: str) -> None:
+    check_choice("launcher", launcher, ("mp", "submitit"))
+    if launcher == "submitit" and not generic._has_submitit:
+        raise ImportError("launcher='submitit' needs submitit: pip install 'torchrl_etl[slurm]'.")
+    if torch.distributed.is_initialized():
+        raise RuntimeError(
+            "DistributedWorkers needs torch's default process group for itself, and there is one "
+            "already in this process. Use RayWorkers, or destroy_process_group() first."
+        )
+
+
+def _one_batch(
+    create_env_fn: Callable[[], EnvBase],
+    policy: TensorDictModuleBase,
+    *,
+    collector_class: type[Collector],
+    **kwargs: Any,
+) -> TensorDictBase:
+    """What a batch of a worker looks like.
+
+    In the place of the one that TorchRL 0.14.1 collects when the workers run already, and by the
+    base class Collector, whose batches may have other entries than collector_class's.
+    """
     with torch.random.fork_rng(devices=[]):
         collector = collector_class(
             create_env_fn, policy, total_frames=-1, return_same_td=True, **kwargs

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -15,6 +16,7 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.collectors.weight_update import RemoteModuleWeightUpdater
 from torchrl.envs import EnvBase
 
+from torchrl_etl.checks import check_integer
 from torchrl_etl.collectors.remote import (
     RemoteWorkers,
     check_arguments,
@@ -103,7 +105,8 @@ class RayWorkers(RemoteWorkers, RayCollector):
         remote_configs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        collector_kwargs = dict(collector_kwargs or {})
+        collector_kwargs = {"auto_register_policy_transforms": False, **(collector_kwargs or {})}
+        remote_configs = {"num_cpus": 1, **(remote_configs or {})}
         check_arguments(
             create_env_fn,
             policy,
@@ -114,23 +117,13 @@ class RayWorkers(RemoteWorkers, RayCollector):
             collector_class=collector_class,
             collector_kwargs=collector_kwargs,
         )
-        if not isinstance(replacements, int) or replacements < 0:
-            raise ValueError(
-                f"replacements must be an integer of at least 0, got {replacements!r}."
-            )
-        if importlib.util.find_spec("ray") is None:
-            raise ImportError("RayWorkers needs Ray: pip install 'torchrl_etl[ray]'.")
+        check_integer(0, replacements=replacements)
         self.create_env_fn, self.seed, self.started = create_env_fn, seed, 0
         self.replacements = replacements
         self._prepare(policy, sync, total_frames, timeout)
         self._pending: dict[Any, tuple[int, Any, float]] = {}
-        remote_configs = {"num_cpus": 1, **(remote_configs or {})}
-        ray_config = {"address": address or "local", "log_to_driver": False}
-        ray_config |= {"logging_level": "error"}
-        if address is None:  # how many workers this machine can bear is the caller's to say
-            slots = int(num_workers * remote_configs["num_cpus"]) + 1
-            ray_config |= {"num_cpus": max(slots, os.cpu_count()), "include_dashboard": False}
-        try:
+        cluster = _cluster(address, cpus=int(num_workers * remote_configs["num_cpus"]))
+        with self._starting():
             super().__init__(
                 create_env_fn,
                 policy,
@@ -139,8 +132,8 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 total_frames=self.total_frames,
                 sync=sync,
                 collector_class=_seeded(collector_class),
-                collector_kwargs={"auto_register_policy_transforms": False, **collector_kwargs},
-                ray_init_config=ray_config | dict(ray_init_config or {}),
+                collector_kwargs=collector_kwargs,
+                ray_init_config={**cluster, **(ray_init_config or {})},
                 remote_configs=remote_configs,
                 # Weights are not left to a scheme. The one of TorchRL 0.14.1 joins all workers in
                 # a process group that a replacement cannot enter, waits for batches under way, and
@@ -148,13 +141,19 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 weight_updater=RemoteModuleWeightUpdater(),
                 **kwargs,
             )
+
+    # Workers ---------------------------------------------------------------------------------
+
+    @contextmanager
+    def _starting(self) -> Iterator[None]:
+        """Around TorchRL's constructor: awaits the workers it starts, and ends what fails."""
+        try:
+            yield
             self._await_start()
         except BaseException:
             if hasattr(self, "_runtime_lease"):
                 self.shutdown()
             raise
-
-    # Workers ---------------------------------------------------------------------------------
 
     def add_collectors(
         self, create_env_fn, num_envs, policy, collector_kwargs, remote_configs
@@ -262,6 +261,16 @@ class RayWorkers(RemoteWorkers, RayCollector):
         self._stopped = True
         self._pending.clear()
         super().shutdown(timeout, shutdown_ray)
+
+
+def _cluster(address: str | None, cpus: int) -> dict[str, Any]:
+    """Arguments of ``ray.init`` that join a cluster, or start one on this machine."""
+    if importlib.util.find_spec("ray") is None:
+        raise ImportError("RayWorkers needs Ray: pip install 'torchrl_etl[ray]'.")
+    config = {"address": address or "local", "log_to_driver": False, "logging_level": "error"}
+    if address is None:  # how many workers this machine can bear is the caller's to say
+        config |= {"num_cpus": max(cpus + 1, os.cpu_count()), "include_dashboard": False}
+    return config
 
 
 def _seeded(collector_class: type[Collector]) -> type[Collector]:

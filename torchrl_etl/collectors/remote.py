@@ -15,6 +15,7 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from torchrl_etl.checks import check_integer, check_real
 from torchrl_etl.collectors.seeds import training_seed
 
 __all__ = [
@@ -183,17 +184,14 @@ def check_arguments(
             f"policy is a {type(policy).__name__}; its weights travel by their names, so it "
             "must be a TensorDictModule such as TensorDictSequential(actor, decoder)."
         )
-    for name, value in {"num_workers": num_workers, "frames_per_batch": frames_per_batch}.items():
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}.")
+    check_integer(1, num_workers=num_workers, frames_per_batch=frames_per_batch)
     if sync and frames_per_batch % num_workers:
         raise ValueError(
             f"frames_per_batch={frames_per_batch} cannot be shared equally by "
             f"num_workers={num_workers}; a multiple of it near by is "
             f"{num_workers * max(1, round(frames_per_batch / num_workers))}."
         )
-    if not timeout > 0:
-        raise ValueError(f"timeout must be a positive number of seconds, got {timeout!r}.")
+    check_real("(0, inf)", timeout=timeout)
     if not (isinstance(collector_class, type) and issubclass(collector_class, Collector)):
         raise TypeError(
             f"collector_class is {collector_class!r}; a worker runs one environment in its own "
