@@ -71,7 +71,7 @@ def main(*names: str) -> None:
 
 
 def draw_clips(name: str, seed: int) -> None:
-    policy, env = zoo.load(name) if name in zoo.names() else (None, make_env(name))
+    policy, env = zoo.load(name) if name in zoo.names(trained=True) else (None, make_env(name))
     env = TransformedEnv(env, InitTracker())  # says where noise is drawn anew
     with recorder_of(env, name) as recorder:
         clips = {name: draw(recorder, noise(env), seed)}
@@ -109,7 +109,7 @@ def simplify(env: EnvBase) -> None:
 
 def names_of_all() -> list[str]:
     """The paper's tasks, then the entries of the zoo that have a body to draw."""
-    drawn = [name for name in zoo.names() if is_drawn(zoo.read_card(name).task["name"])]
+    drawn = [name for name in zoo.names(trained=True) if is_drawn(zoo.read_card(name).task["name"])]
     return list(dict.fromkeys([*(task.name for task in list_tasks()), *drawn]))
 
 

@@ -19,10 +19,11 @@ from tests.commands import command
 from tests.configs import BRIEFLY, CONF, ELBOW, tiny
 from torchrl_etl import zoo
 from torchrl_etl.command_line import translate
-from torchrl_etl.envs import make_env
+from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.export import command_of, describe_policy, export_run, rebuilt
-from torchrl_etl.synergies.bundle import load_bundle
+from torchrl_etl.opened import open_zoo
+from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training import evaluate_task, resumed_config
 from torchrl_etl.zoo import ZooError
 
@@ -67,11 +68,17 @@ def observations(size: int) -> TensorDict:
     return TensorDict({"observation": torch.randn(5, size, generator=generator)}, [5])
 
 
-@pytest.mark.parametrize("name", zoo.names())
+def test_the_synergies_of_the_hand_fit_all_tasks_of_the_hand():
+    _, info = load_bundle(zoo.synergies("myohand"))
+    for task in ("myoHandPose", "myo2HandPose", "myoHandKeyTurn", "myoHandPenTwirl"):
+        spec = EnvironmentSpec.of(make_env(task))
+        check_compatible(info, spec.actuators, spec.low.tolist(), spec.high.tolist())
+    subject = open_zoo("myohand")
+    assert subject.policy is None and subject.decoder.num_synergies == 8
+
+
+@pytest.mark.parametrize("name", zoo.names(trained=True))
 def test_every_entry_repeats_the_numbers_of_its_card(name):
-    if not (zoo.find(name) / "card.json").exists():
-        load_bundle(zoo.synergies(name))
-        return
     policy, env = zoo.load(name)
     card, again = zoo.read_card(name), 2
     found = evaluate_task(policy, env, card.task, episodes=again)

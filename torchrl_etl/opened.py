@@ -87,6 +87,8 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
 def open_zoo(name: str) -> Subject:
     """The policy of an entry of the zoo, and its synergies where it acts through some.
 
+    An entry of synergies alone is shown on the task that they were explored on.
+
     Args:
         name (str): an entry, see :func:`torchrl_etl.zoo.find`.
 
@@ -98,6 +100,8 @@ def open_zoo(name: str) -> Subject:
         >>> open_zoo("overactuated").drivers[0]
         'policy'
     """
+    if name in zoo.names() and name not in zoo.names(trained=True):
+        return open_bundle(zoo.synergies(name))
     card = zoo.read_card(name)
     policy, env = zoo.load(name)
     env.close()

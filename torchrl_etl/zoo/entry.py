@@ -29,14 +29,18 @@ ENTRIES = Path(__file__).parent / "entries"
 """The folder of the entries that come with torchrl_etl."""
 
 
-def names() -> list[str]:
+def names(*, trained: bool = False) -> list[str]:
     """Names of the entries that come with torchrl_etl.
 
+    Keyword Args:
+        trained (bool): leave out those of synergies alone. Default: ``False``.
+
     Examples:
-        >>> "overactuated" in names()
-        True
+        >>> "myohand" in names(), "myohand" in names(trained=True)
+        (True, False)
     """
-    return sorted(path.name for path in ENTRIES.iterdir() if path.is_dir())
+    entries = (path for path in ENTRIES.iterdir() if path.is_dir())
+    return sorted(path.name for path in entries if not trained or (path / CARD).exists())
 
 
 def find(name: str | os.PathLike[str]) -> Path:
