@@ -21,6 +21,7 @@ __all__ = [
     "check_sizes",
     "naming",
     "not_finite",
+    "renaming",
 ]
 
 
@@ -129,6 +130,24 @@ def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
     except ValueError as error:
         kind = _NamedInFull if in_full else type(error)
         raise kind(f"{section}.{error}") from error
+
+
+@contextmanager
+def renaming(**names: str) -> Iterator[None]:
+    """Let a check call an argument by the name that whoever passes it on has for it.
+
+    Examples:
+        >>> with renaming(share="relabel"):
+        ...     check_real("[0, 1]", share=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: relabel is 2; it must be a number in [0, 1].
+    """
+    try:
+        yield
+    except ValueError as error:
+        name, _, said = str(error).partition(" ")
+        raise type(error)(f"{names.get(name, name)} {said}") from error
 
 
 def check_flag(**values: object) -> None:

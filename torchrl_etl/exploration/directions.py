@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_real, naming
+from torchrl_etl.checks import naming, renaming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.modules import StateEncoder
@@ -52,13 +52,13 @@ class DirectionExploration(Exploration):
         relabel: float = 1.0,
     ) -> None:
         super().__init__(spec)
-        check_real("[0, 1]", relabel=relabel)
         with naming("encoder"):
             self.encoder = StateEncoder(spec.observation_dim, **encoder).to(spec.device)
         self.inputs = {"direction": self.encoder.embedding_dim}
         with naming("direction"):
             self.primer = DirectionPrimer(self.encoder.embedding_dim, **direction)
-        self._redraw = RedrawDirection(self.primer.clone(), share=relabel)
+        with renaming(share="relabel"):
+            self._redraw = RedrawDirection(self.primer.clone(), share=relabel)
         with naming("bonus"):
             self._bonus = IntrinsicReward(self.encoder, **bonus)
 

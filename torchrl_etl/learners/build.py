@@ -78,9 +78,7 @@ def build_learner(
     Raises:
         ValueError: naming the argument that cannot be used.
     """
-    sac, noise, device = dict(sac), dict(noise), action_spec.device
-    with naming("noise"):
-        check_choice("kind", kind := noise.pop("kind"), get_args(Noise))
+    sac, device = dict(sac), action_spec.device
     with naming("sac"):
         check_flag(normalize_observations=(norm := sac.pop("normalize_observations")))
     normalizer = RunningNorm(observation_dim).to(device) if norm else None
@@ -93,12 +91,8 @@ def build_learner(
         policy = make_actor(inputs, emitted, out_key=out_key, **actor).to(device)
     with naming("critic"):
         value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
-    if make_behavior is not None:
-        behavior = make_behavior(policy)
-    else:
-        with naming("noise"):
-            behavior = HeldNoise(policy, **noise) if kind == "held" else policy
-    behavior, options = wrap(behavior), dict(more(policy))
+    explore = make_behavior or partial(with_noise, **noise)
+    behavior, options = wrap(explore(policy)), dict(more(policy))
     if init_random_actions:
         warmup = UniformWarmup(emitted, init_random_actions, action_key=out_key)
         behavior = TensorDictSequential(behavior, warmup)
@@ -116,3 +110,10 @@ def build_learner(
             **sac,
             **options,
         )
+
+
+def with_noise(actor: Actor, *, kind: Noise, **options: Any) -> TensorDictModuleBase:
+    """The actor as it explores: its noise is drawn anew at every step, or held for several."""
+    with naming("noise"):
+        check_choice("kind", kind, get_args(Noise))
+        return HeldNoise(actor, **options) if kind == "held" else actor

@@ -18,7 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
-from torchrl_etl.checks import check_flag, check_integer, check_real
+from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -116,29 +116,23 @@ class SACLearner:
         check_real("(0, inf)", lr=lr, alpha_init=alpha_init)
         check_integer(1, num_critics=num_critics, bins=bins)
         check_flag(unit_rows=unit_rows)
-        if return_bound is not None:
-            check_real("(0, inf)", return_bound=return_bound)
         self.gamma, self.lr_end, self.device = gamma, lr_end, next(actor.parameters()).device
         self.on_frames, self.on_restart = on_frames, on_restart
-        options: dict[str, Any] = {
-            "action_spec": action_spec,
-            "target_entropy": target_entropy,
-            "alpha_init": alpha_init,
-            "num_qvalue_nets": num_critics,
-            "loss_function": loss_function,
-            "support": support(bins, return_bound),
-        }
-        if decoder is None:
-            sac = LeanSACLoss(actor, critic, **options)
-        else:
-            sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
-        self.objective = Objective(
-            sac,
+        scale = make_return_scale(gamma, return_bound)
+        sac = make_loss(
             actor,
-            terms,
-            normalizer=normalizer,
-            return_scale=None if return_bound is None else ReturnScale(gamma, bound=return_bound),
-            reward=reward,
+            critic,
+            decoder,
+            train_decoder=train_decoder,
+            action_spec=action_spec,
+            target_entropy=target_entropy,
+            alpha_init=alpha_init,
+            num_qvalue_nets=num_critics,
+            loss_function=loss_function,
+            support=support(bins, return_bound),
+        )
+        self.objective = Objective(
+            sac, actor, terms, normalizer=normalizer, return_scale=scale, reward=reward
         ).to(self.device)
         sac.make_value_estimator(gamma=gamma)
         _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
@@ -156,8 +150,7 @@ class SACLearner:
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self.compile = compile
         self._gradients = compiled(self.gradients) if compile else self.gradients
-        graphed = compile and self.device.type == "cuda"
-        self._step = cuda_graph(self.step) if graphed else self.step
+        self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Learn from a batch of transitions [B]; returns scalars to log."""
@@ -229,6 +222,28 @@ class SACLearner:
             "ema": self.ema,
             "optimizer": self.optimizer,
         }
+
+
+def make_loss(
+    actor: ProbabilisticTensorDictSequential,
+    critic: TensorDictModule,
+    decoder: SynergyMap | None,
+    *,
+    train_decoder: bool,
+    **options: Any,
+) -> LeanSACLoss:
+    """SAC's losses, of actions or of the synergies that a decoder turns into actions."""
+    if decoder is None:
+        return LeanSACLoss(actor, critic, **options)
+    return SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
+
+
+def make_return_scale(gamma: float, return_bound: float | None) -> ReturnScale | None:
+    """What divides the reward so that returns stay within the bound, if there is one."""
+    if return_bound is None:
+        return None
+    with renaming(bound="return_bound"):
+        return ReturnScale(gamma, bound=return_bound)
 
 
 def from_observation(

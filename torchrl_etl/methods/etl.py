@@ -13,7 +13,7 @@ from torchrl.data import Bounded
 
 from torchrl_etl import zoo
 from torchrl_etl.analysis import describe_synergies, direction_alignment
-from torchrl_etl.checks import check_choice, check_real, naming
+from torchrl_etl.checks import check_choice, check_real, naming, renaming
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term, entropy_target
@@ -242,22 +242,20 @@ class ETL(Method):
         options = self.context.options("learn")["decoder"]
         with naming("learn.decoder"):
             check_choice("fine_tuning", mode := options["fine_tuning"], get_args(FineTuning))
-            check_real("[0, inf)", distillation_weight=options["distillation_weight"])
             check_real("(0, inf)", lr=options["lr"])
             if options["residual_std"] is not None:
                 check_real("(0, inf)", residual_std=options["residual_std"])
                 check_real("(0, 1]", residual=options["residual"])
         weight = {"frozen": 0.0, "reconstruction": 1.0}.get(mode, options["distillation_weight"])
         decoder = decoder.to(self.context.device).requires_grad_(mode != "frozen")
+        with naming("learn.decoder"), renaming(weight="distillation_weight"):
+            term = Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder,
             make_actor=partial(make_actor, **self._quiet),
             entropy=self._entropy_target,
-            more=lambda actor: {
-                "train_decoder": mode == "critic",
-                "terms": [Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])],
-            },
+            more=lambda actor: {"train_decoder": mode == "critic", "terms": [term]},
         )
         room = self.context.config.explore.frames if self.prefills else 0
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.modules.running_moments import RunningMoments
 
 __all__ = ["ReturnScale"]
@@ -38,10 +39,8 @@ class ReturnScale(RunningMoments):
 
     def __init__(self, gamma: float, *, bound: float = 5.0) -> None:
         super().__init__()
-        if not 0.0 <= gamma < 1.0:
-            raise ValueError(f"gamma is {gamma}; it is a discount factor and must lie in [0, 1).")
-        if not bound > 0.0:
-            raise ValueError(f"bound is {bound}; it is the largest return and must be above 0.")
+        check_real("[0, 1)", gamma=gamma)
+        check_real("(0, inf)", bound=bound)
         self.gamma, self.bound = gamma, bound
         self.register_buffer("largest", torch.zeros((), dtype=torch.float64))
         self.forget()

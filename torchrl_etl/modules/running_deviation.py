@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_etl.checks import check_real
+
 __all__ = ["RunningDeviation"]
 
 
@@ -31,8 +33,7 @@ class RunningDeviation(nn.Module):
 
     def __init__(self, decay: float) -> None:
         super().__init__()
-        if not 0.0 < decay < 1.0:
-            raise ValueError(f"decay is {decay}; it must lie strictly between 0 and 1.")
+        check_real("(0, 1)", decay=decay)
         self.decay = decay
         self.register_buffer("mean", torch.zeros(()))
         # Never averaged in (the first update has full weight): it makes an unused divisor 1.

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules import GMVAE
 from torchrl_etl.objectives.checks import check_parts
@@ -84,11 +84,7 @@ class GMVAELoss(LossModule):
     ) -> None:
         check_choice("reduction", reduction, ("mean", "sum", "none"))
         check_parts("gmvae", gmvae, GMVAE)
-        if min(kl_weight, component_kl_weight) < 0.0:
-            raise ValueError(
-                f"kl_weight is {kl_weight} and component_kl_weight {component_kl_weight}; neither "
-                "may be negative."
-            )
+        check_real("[0, inf)", kl_weight=kl_weight, component_kl_weight=component_kl_weight)
         super().__init__()
         self.kl_weight, self.component_kl_weight = kl_weight, component_kl_weight
         self.reduction = reduction

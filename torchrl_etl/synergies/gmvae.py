@@ -49,7 +49,6 @@ class GMVAESynergies(SynergyModel):
         updates: int = 2000,
     ) -> None:
         check_real("(0, inf)", lr=lr)
-        check_real("[0, inf)", kl_weight=kl_weight, component_kl_weight=component_kl_weight)
         check_sizes(hidden=hidden)
         check_integer(1, updates=updates)
         self.num_synergies, self.lr, self.updates = num_synergies, lr, updates

@@ -151,7 +151,14 @@ def validate(config: DictConfig) -> None:
     check_sizes(**{"vaf_curve.dims": config.vaf_curve.dims})
     check_integer(2, **{"checkpoint.keep": config.checkpoint.keep})
     check_integer(0, **{"explore.fit.final_updates": config.explore.fit.final_updates})
-    check_real("(0, inf)", **{"collector.timeout": config.collector.timeout})
+    check_real(
+        "(0, inf)",
+        **{
+            "collector.timeout": config.collector.timeout,
+            "explore.replay_ratio": config.explore.replay_ratio,
+            "learn.replay_ratio": config.learn.replay_ratio,
+        },
+    )
     check_choice("stage", config.stage, ("explore", "learn", "all"))
     check_choice("collector.kind", config.collector.kind, COLLECTORS)
     resolve_task(config.env, config.goal)

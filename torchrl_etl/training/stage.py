@@ -123,7 +123,7 @@ class Stage:
         check_integer(1, frames=frames, n_steps=n_steps)
         check_integer(2, batch_size=batch_size, buffer_size=buffer_size)
         check_integer(0, learning_starts=learning_starts)
-        check_real("(0, inf)", replay_ratio=replay_ratio, reward_scale=reward_scale)
+        check_real("(0, inf)", reward_scale=reward_scale)
         check_choice("buffer_storage", buffer_storage, ("memory", "memmap"))
         self.name, self.learner, self.seed, self.device = name, learner, seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale

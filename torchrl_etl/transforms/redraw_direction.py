@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right, unravel_key
 from torchrl.envs.transforms import Transform
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.transforms.direction import DirectionPrimer
 
 __all__ = ["RedrawDirection"]
@@ -50,11 +51,7 @@ class RedrawDirection(Transform):
     """
 
     def __init__(self, primer: DirectionPrimer, *, share: float = 1.0) -> None:
-        if not 0 <= share <= 1:
-            raise ValueError(
-                f"share is {share!r}; it is the probability that a transition gets a new "
-                "direction and must lie in [0, 1]."
-            )
+        check_real("[0, 1]", share=share)
         super().__init__(in_keys=primer.out_keys, out_keys=primer.out_keys)
         self.primer, self.share = primer, share
 

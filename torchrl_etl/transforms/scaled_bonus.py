@@ -39,7 +39,7 @@ class ScaledBonus(TransitionReward):
             TorchRL puts transforms of envs and buffers in eval mode. Default: ``True``.
 
     Raises:
-        ValueError: if ``decay`` is outside (0, 1) or ``extrinsic_weight`` is negative.
+        ValueError: if ``decay`` is used and outside (0, 1), or ``extrinsic_weight`` is negative.
     """
 
     def __init__(
@@ -54,7 +54,6 @@ class ScaledBonus(TransitionReward):
         update_statistics: bool = True,
     ) -> None:
         check_flag(normalize=normalize, update_statistics=update_statistics)
-        check_real("(0, 1)", decay=decay)
         check_real("[0, inf)", extrinsic_weight=extrinsic_weight)
         super().__init__(in_keys=list(in_keys), out_keys=[out_key])
         self.deviation = RunningDeviation(decay) if normalize else None
