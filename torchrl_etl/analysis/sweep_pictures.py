@@ -128,17 +128,23 @@ def task_picture(
         entries.values(), entries.keys(), loc="outside right upper", frameon=False, fontsize=9
     )
     figure.suptitle("{} ({} goal)".format(*runs[0].setting))
-    caption = "Line: mean over seeds (n). Band: 95 % bootstrap interval; of two seeds, their range."
-    known = (*published_curves(env_id), *published_curves(env_id, "success"))
-    begin = min((curve.frames[0] for curve in known), default=None)
-    if begin is not None and begin <= _reach(end):
-        caption = " ".join((caption, caveats(env_id), *notes))
-    elif begin is not None:
-        caption += f" Published curves begin at {begin:,} frames."
+    caption = _caption(env_id, notes, end)
     lines = textwrap.fill(caption, int(16 * figure.get_figwidth()), break_on_hyphens=False)
     # supxlabel, unlike a free text, is given room by the layout.
     figure.supxlabel(lines, x=0.01, ha="left", fontsize=8, color="0.35", linespacing=1.3)
     return write(figure, path)
+
+
+def _caption(env_id: str, notes: Sequence[str], end: int) -> str:
+    """What the lines mean, and where published curves are what to know of them."""
+    caption = "Line: mean over seeds (n). Band: 95 % bootstrap interval; of two seeds, their range."
+    known = (*published_curves(env_id), *published_curves(env_id, "success"))
+    begin = min((curve.frames[0] for curve in known), default=None)
+    if begin is None:
+        return caption
+    if begin > _reach(end):
+        return f"{caption} Published curves begin at {begin:,} frames."
+    return " ".join((caption, caveats(env_id), *notes))
 
 
 def overall_picture(

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_uniform
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
@@ -166,12 +166,9 @@ class EMELoss(LossModule):
                 f"policy_keys is {policy_keys} but the actor writes {list(actor.out_keys)}; name "
                 "the two keys of its Gaussian's mean and standard deviation."
             )
-        if not 0.0 <= gamma < 1.0:
-            raise ValueError(f"gamma is {gamma}; it must be in [0, 1) for distances to be finite.")
-        if policy_weight < 0.0:
-            raise ValueError(f"policy_weight is {policy_weight}; it must not be negative.")
-        if not 0.0 < subset_share <= 1.0:
-            raise ValueError(f"subset_share is {subset_share}; it must be above 0, and at most 1.")
+        check_real("[0, 1)", gamma=gamma)  # for distances to be finite
+        check_real("[0, inf)", policy_weight=policy_weight)
+        check_real("(0, 1]", subset_share=subset_share)
 
         super().__init__()
         self.gamma, self.policy_weight, self.subset_share = gamma, policy_weight, subset_share

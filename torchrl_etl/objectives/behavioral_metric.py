@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 
@@ -154,28 +154,9 @@ class BehavioralMetricLoss(LossModule):
         check_choice("pairs", pairs, ("permuted", "all"))
         check_choice("reduction", reduction, ("mean", "sum", "none"))
         check_parts("encoder", encoder, TensorDictModuleBase, outputs=1)
-        if divergence == "gaussian":
-            if dynamics is None:
-                raise ValueError(
-                    "divergence='gaussian' compares predicted next embeddings but dynamics is "
-                    "None; pass GaussianDynamics(embedding_dim) or choose divergence='sampled'."
-                )
-            check_parts("dynamics", dynamics, TensorDictModuleBase, outputs=2)
-            if distance != "l2":
-                raise ValueError(
-                    f"divergence='gaussian' is a Wasserstein distance over 'l2' but distance is "
-                    f"{distance!r}; choose distance='l2' or divergence='sampled'."
-                )
-        elif dynamics is not None:
-            raise ValueError(
-                "dynamics is given but divergence='sampled' does not read it; leave it out or "
-                "choose divergence='gaussian'."
-            )
-        if not 0.0 <= gamma < 1.0:
-            raise ValueError(f"gamma is {gamma}; it must be in [0, 1) for distances to be finite.")
-        for name, value in (("epsilon", epsilon), ("margin", margin), ("weight", weight)):
-            if value < 0.0:
-                raise ValueError(f"{name} is {value}; it must not be negative.")
+        _check_divergence(divergence, distance, dynamics)
+        check_real("[0, 1)", gamma=gamma)  # for distances to be finite
+        check_real("[0, inf)", epsilon=epsilon, margin=margin, weight=weight)
 
         super().__init__()
         self.divergence, self.distance, self.pairs = divergence, distance, pairs
@@ -278,6 +259,27 @@ class BehavioralMetricLoss(LossModule):
     def _distance(self, embedding: Tensor, partner: Tensor) -> Tensor:
         """Distances [samples, pairs per sample]."""
         return _DISTANCES[self.distance](embedding.unsqueeze(1), embedding[partner])
+
+
+def _check_divergence(divergence: str, distance: str, dynamics: object) -> None:
+    """Refuse a divergence without what it is computed of, or beside what it does not read."""
+    if divergence == "gaussian":
+        if dynamics is None:
+            raise ValueError(
+                "divergence='gaussian' compares predicted next embeddings but dynamics is None; "
+                "pass GaussianDynamics(embedding_dim) or choose divergence='sampled'."
+            )
+        check_parts("dynamics", dynamics, TensorDictModuleBase, outputs=2)
+        if distance != "l2":
+            raise ValueError(
+                f"divergence='gaussian' is a Wasserstein distance over 'l2' but distance is "
+                f"{distance!r}; choose distance='l2' or divergence='sampled'."
+            )
+    elif dynamics is not None:
+        raise ValueError(
+            "dynamics is given but divergence='sampled' does not read it; leave it out or choose "
+            "divergence='gaussian'."
+        )
 
 
 def _dynamics_nll(value: Tensor, loc: Tensor, scale: Tensor) -> Tensor:

@@ -123,16 +123,7 @@ def save_bundle(
         encoder=None if encoder is None else encoder.config,
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
-    folder = Path(path).resolve()
-    if folder.exists() and (
-        not folder.is_dir()
-        or (others := {file.name for file in folder.iterdir()} - {*BUNDLE_FILES})
-    ):
-        held = f"holds {some(sorted(others))}" if folder.is_dir() else "is a file"
-        raise BundleError(
-            f"{str(folder)!r} {held}, and saving a bundle there would remove it; choose a folder "
-            "of its own, such as synergies/ in the run folder."
-        )
+    folder = _own_folder(path)
     replace_folder(folder, {_TENSORS: tensors, DESCRIPTION: description})
     return folder
 
@@ -277,6 +268,21 @@ def _plain(value: Any, where: str) -> Any:
         f"{where} is a {type(value).__name__}, which JSON cannot hold; pass numbers, strings, "
         "lists or dicts."
     )
+
+
+def _own_folder(path: str | os.PathLike[str]) -> Path:
+    """A folder for a bundle, which may hold an older one and nothing else."""
+    folder = Path(path).resolve()
+    if folder.exists() and (
+        not folder.is_dir()
+        or (others := {file.name for file in folder.iterdir()} - {*BUNDLE_FILES})
+    ):
+        held = f"holds {some(sorted(others))}" if folder.is_dir() else "is a file"
+        raise BundleError(
+            f"{str(folder)!r} {held}, and saving a bundle there would remove it; choose a folder "
+            "of its own, such as synergies/ in the run folder."
+        )
+    return folder
 
 
 def _find_folder(path: Path) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -108,16 +108,9 @@ def validate(config: DictConfig) -> None:
     Raises:
         ValueError: naming the key, what came and what is expected.
     """
-    with extra("recipes"):
-        from omegaconf import OmegaConf
     for name in ("env", "run_dir", "device"):
         if not isinstance(config[name], str) or not config[name]:
             raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
-    check_flag(
-        progress=config.progress,
-        pictures=config.pictures,
-        **{"learn.prefill": config.learn.prefill, "collector.ahead": config.collector.ahead},
-    )
     if not isinstance(config.env_kwargs, Mapping):
         raise ValueError(
             f"env_kwargs is {config.env_kwargs!r}; it must be arguments by name, such as "
@@ -128,43 +121,37 @@ def validate(config: DictConfig) -> None:
     key = config.success_key
     if key is not None and (not isinstance(key, str) or not key):
         raise ValueError(f"success_key is {key!r}; it must name an entry of info, or be null.")
-    for name in ("frames", "threads", "num_synergies"):
-        if config[name] is not None:
-            check_integer(1, **{name: config[name]})
-    check_integer(0, seed=config.seed, restart_seed=config.restart_seed)
-    check_integer(0, **{"evaluation.every": config.evaluation.every})
-    if config.seed >= 2**31:
-        raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
-    check_integer(
-        1,
-        action_repeat=config.action_repeat,
-        log_every=config.log_every,
-        **{
-            key: OmegaConf.select(config, key)
-            for key in (
-                *("collector.num_envs", "collector.num_workers", "collector.frames_per_batch"),
-                *("evaluation.episodes", "checkpoint.every", "vaf_curve.updates"),
-                *("explore.frames", "learn.frames"),
-            )
-        },
-    )
-    check_sizes(**{"vaf_curve.dims": config.vaf_curve.dims})
-    check_integer(2, **{"checkpoint.keep": config.checkpoint.keep})
-    check_integer(0, **{"explore.fit.final_updates": config.explore.fit.final_updates})
-    check_real(
-        "(0, inf)",
-        **{
-            "collector.timeout": config.collector.timeout,
-            "explore.replay_ratio": config.explore.replay_ratio,
-            "learn.replay_ratio": config.learn.replay_ratio,
-        },
-    )
+    _check_values(config)
     check_choice("stage", config.stage, ("explore", "learn", "all"))
     check_choice("collector.kind", config.collector.kind, COLLECTORS)
     resolve_task(config.env, config.goal)
     _check_collector(config.collector)
     _check_loggers(config.log)
     _check_device(config.device)
+
+
+def _check_values(config: DictConfig) -> None:
+    with extra("recipes"):
+        from omegaconf import OmegaConf
+
+    def of(*keys: str) -> dict[str, Any]:
+        return {key: OmegaConf.select(config, key) for key in keys}
+
+    check_flag(**of("progress", "pictures", "learn.prefill", "collector.ahead"))
+    for optional in ("frames", "threads", "num_synergies"):
+        if config[optional] is not None:
+            check_integer(1, **of(optional))
+    check_integer(0, **of("seed", "restart_seed", "evaluation.every", "explore.fit.final_updates"))
+    if config.seed >= 2**31:
+        raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
+    check_integer(1, **of("action_repeat", "log_every", "evaluation.episodes", "checkpoint.every"))
+    check_integer(2, **of("checkpoint.keep"))
+    check_integer(1, **of("explore.frames", "learn.frames", "vaf_curve.updates"))
+    check_real("(0, inf)", **of("explore.replay_ratio", "learn.replay_ratio"))
+    check_sizes(**of("vaf_curve.dims"))
+    workers = of("collector.num_envs", "collector.num_workers", "collector.frames_per_batch")
+    check_integer(1, **workers)
+    check_real("(0, inf)", **of("collector.timeout"))
 
 
 def of_each_seed(config: DictConfig) -> list[DictConfig]:

@@ -116,16 +116,7 @@ def run_stage(
     if stage.finished:
         return None
 
-    with extra("recipes"):
-        from tqdm import tqdm
-    bar = tqdm(
-        total=stage.budget,
-        initial=stage.frames,
-        desc=stage.name,
-        unit="frame",
-        disable=not show_progress,
-        mininterval=0.5,
-    )
+    bar = _progress_bar(stage, show_progress)
     last = None
     report = _Report(stage, folder, bar, offset)
     try:
@@ -165,6 +156,19 @@ def _refuse_lost_checkpoints(stage: Stage, folder: RunFolder) -> None:
             f"holds none of its checkpoints; copy checkpoints/{stage.name} back, or start a new "
             "run."
         )
+
+
+def _progress_bar(stage: Stage, show: bool) -> tqdm:
+    with extra("recipes"):
+        from tqdm import tqdm
+    return tqdm(
+        total=stage.budget,
+        initial=stage.frames,
+        desc=stage.name,
+        unit="frame",
+        disable=not show,
+        mininterval=0.5,
+    )
 
 
 class _Report:
