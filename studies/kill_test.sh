@@ -2,8 +2,9 @@
 # Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles.
 #
 #     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
+#     JOBS=2 sh studies/kill_test.sh               both seeds at a time
 #
-# One process after another, a thread each, two seeds; rows go to docs/results/kill_test. Kill it at
+# A thread a run, two seeds, one after the other by default; rows go to docs/results/kill_test. Kill it at
 # any time and start it again, here or on another machine: finished runs stay (the table alone is
 # enough), others go on from their checkpoints, and an oracle is made when what it needs is there.
 # It takes 1.5 to 2 hours a run on a free core with AVX2.
@@ -23,7 +24,7 @@ settings="learn.replay_ratio=0.125 learn.learning_starts=5000 learn.buffer_size=
 
 queue() {
   $python recipes/sweep.py "tasks=[$task]" "methods=[$1]" 'seeds=[0,1]' frames="$frames" \
-    out=$out jobs=1 settings="$(echo $settings)"
+    out=$out jobs="${JOBS:-1}" settings="$(echo $settings)"
 }
 
 queue sac
