@@ -6,16 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
-from torchrl.data import Bounded
 
-from torchrl_etl.baselines.lattice import (
-    LatticeNormal,
-    lattice_scale_tril,
-)
-
-LOW, HIGH = torch.tensor([0.0, -1.0, -3.0]), torch.tensor([1.0, 1.0, 5.0])
-SPEC = Bounded(LOW, HIGH, shape=(3,))
-KINDS = [{"state_dependent": False}, {"state_dependent": True}]
+from tests.test_baselines_lattice import HIGH, LOW
+from torchrl_etl.baselines.lattice import LatticeNormal, lattice_scale_tril
 
 
 @pytest.fixture(autouse=True)
