@@ -187,8 +187,15 @@ def test_rows_of_the_controller_are_independent() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"kappa": 0}, {"tau": 0}, {"time_distance": 0}, {"bias_rate": -1}, {"s4avg": 0.5}]
+    ("settings", "message"),
+    [
+        ({"kappa": 0}, "positive"),
+        ({"tau": 0}, "tau is 0; it must be a whole number, 1 or more"),
+        ({"time_distance": 0}, "time_distance is 0; it must be a whole number, 1 or more"),
+        ({"bias_rate": -1}, "positive"),
+        ({"s4avg": 0.5}, "positive"),
+    ],
 )
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"positive"):
+def test_settings_out_of_range_are_refused(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DEPExploration(SPEC, **settings)
