@@ -16,7 +16,7 @@ __all__ = ["together"]
 
 
 def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
-    """Do all works in turns, and updates that are due at the same time as one unless compiled.
+    """Do all works in turns, and updates that are due at the same time as one.
 
     Each work finds the random generators as it left them, and its updates get the random numbers
     that it would have drawn for them by itself: it ends with the numbers of
@@ -76,12 +76,11 @@ class _Run(Generic[Result]):
 
 def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
     """Update the learners of these runs, which are in the same stage."""
-    # The pass over several does not compile (torch 2.13): compiled, each by itself is faster.
-    if len(runs) == 1 or runs[0].due.learner.compile:
-        for run in runs:
-            with run:
-                scalars = run.due.learner.updates(run.due.batches)
-            run.go_on(scalars)
+    if len(runs) == 1:
+        (run,) = runs
+        with run:
+            scalars = run.due.learner.updates(run.due.batches)
+        run.go_on(scalars)
         return
     learners = [run.due.learner for run in runs]
     group = groups.get(stage := runs[0].due.stage)
