@@ -32,9 +32,14 @@ def an_operation_unknown_to_the_compiler(x: torch.Tensor) -> torch.Tensor:
     return slope(x)
 
 
+def refuse(graph: torch.fx.Graph) -> None:
+    raise ValueError("this graph cannot be lowered")
+
+
 @pytest.mark.parametrize(
     ("function", "patch", "words"),
     [
+        (slope, {"post_grad_custom_pre_pass": refuse}, "ValueError: this graph cannot be lowered;"),
         (slope, NOWHERE, r"no C\+\+ compiler \(/nowhere/g\+\+ does not run\); install one"),
         (slope, {"cpp.cxx": (None, "false")}, "no C"),
         (an_operation_unknown_to_the_compiler, {}, "compile=false leaves out the attempt"),

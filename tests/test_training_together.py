@@ -83,3 +83,14 @@ def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypat
     assert [type(end) for end in ends] == [Interrupted, Interrupted]
     goes_on = [Experiment(resumed_config(run), resume=run).work(StopOnSignal()) for run in runs]
     assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]
+
+
+def test_seeds_whose_updates_are_compiled_for_a_cpu_take_turns(tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("the pass over several takes longer there")
+
+    monkeypatch.setattr(SideBySide, "__init__", refuse)
+    monkeypatch.setattr("torchrl_etl.learners.sac.compiled", lambda function: function)
+    settings = ("method=sac", "compile=true")
+    ends = together([work(tmp_path / f"{seed}", seed, *settings) for seed in (0, 1)])
+    assert [end["seed"] for end in ends] == [0, 1]

@@ -131,7 +131,8 @@ def _reason(error: BaseException) -> str:
                     f"{cause.filename}: {cause.strerror}; name a folder that can be written, and "
                     "has room, in the variable TORCHINDUCTOR_CACHE_DIR"
                 )
-    return f"{type(error).__name__}: {_first_line(str(error))}; {_ELSE}"
+    told = getattr(error, "inner_exception", None) or error
+    return f"{type(told).__name__}: {_first_line(str(told))}; {_ELSE}"
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
