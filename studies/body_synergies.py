@@ -9,6 +9,9 @@ torque of its joint, by the pseudo-inverse of moment arms times peak forces arou
 a reset: the muscle that pulls most for it comes to about full activation, its opponents to none.
 Nothing was explored for it: it is a bound for what exploration could find about the body.
 
+``--shuffle SEED`` lets the muscles change places, a control: the same activation at rest, as many
+synergies of the same strength, and no sense in them.
+
 With ``--num-synergies`` below the number of joints synergies are the combinations of joints that
 muscles turn most, by their singular values, each joint in units of what its muscles can do.
 """
@@ -44,6 +47,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--num-synergies", type=int, help="default: one for each joint")
     parser.add_argument("--rest", type=float, default=0.25, help="activation of coefficients 0")
+    parser.add_argument("--shuffle", type=int, metavar="SEED", help="let muscles change places")
     arguments = parser.parse_args()
     quiet_torchrl()
     with one_sentence(ValueError, OSError):
@@ -51,12 +55,15 @@ def main() -> None:
         env.reset()
         torques = joint_torques(env)
         changes = muscle_changes(torques.matrix, arguments.num_synergies)
+        if arguments.shuffle is not None:
+            changes = np.random.default_rng(arguments.shuffle).permutation(changes, axis=1)
         decoder = body_decoder(env, changes, arguments.rest)
         known = {
             "joint_share": joint_share(env, decoder, torques.matrix),
             "control_authority": control_authority(decoder).mean().item(),
             "joints": torques.joints,
             "rest": arguments.rest,
+            "shuffle": arguments.shuffle,
             "frames": 0,  # nothing is charged: this is a bound
             **facts(),
         }

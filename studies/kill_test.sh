@@ -1,5 +1,6 @@
 #!/bin/sh
-# Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles.
+# Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles;
+# one of these also with its muscles shuffled, a control.
 #
 #     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
 #     JOBS=2 sh studies/kill_test.sh               both seeds at a time
@@ -32,6 +33,9 @@ queue etl
 [ -d "runs/oracles/body-$task" ] ||
   $python studies/body_synergies.py "$task" "runs/oracles/body-$task"
 queue etl_body
+[ -d "runs/oracles/body_shuffled-$task" ] ||
+  $python studies/body_synergies.py "$task" "runs/oracles/body_shuffled-$task" --shuffle 0
+queue etl_body_shuffled
 learned=$out/$task-sac-seed0
 for model in gmvae pca; do
   oracle=runs/oracles/learned_$model-$task

@@ -67,6 +67,8 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
     decoder, info = load_bundle(tmp_path / "body")
     assert decoder.num_synergies == 5
     assert info.facts["joint_share"] > 0.8
+    study("body_synergies.py", TASK, tmp_path / "other", "--num-synergies", 5, "--shuffle", 0)
+    assert load_bundle(tmp_path / "other")[1].facts["joint_share"] < 0.75  # chance: 0.59
     assert list(info.actuators) == actuator_names(TASK)
 
     run = tmp_path / "run"
