@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from body_synergies import body_decoder, muscle_changes
 from omegaconf import DictConfig
 from rows import append
 from torch import Tensor
@@ -30,7 +29,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.analysis import joint_effects
 from torchrl_etl.command_line import one_sentence, quiet_torchrl
-from torchrl_etl.envs import excitation, joint_torques, make_env
+from torchrl_etl.envs import body_decoder, excitation, joint_torques, make_env, muscle_changes
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import load_bundle
 from torchrl_etl.training import resumed_config
@@ -94,7 +93,7 @@ def references(env: EnvBase, torques: np.ndarray, num_synergies: int) -> dict[st
     return {
         "uniform_actions": middle + half * (2 * torch.rand(SAMPLES, len(half)) - 1),
         "random_directions": decoded(random),
-        "body": decoded(body_decoder(env, muscle_changes(torques), REST)),
+        "body": decoded(body_decoder(env, muscle_changes(torques), rest=REST)),
     }
 
 

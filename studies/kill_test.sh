@@ -30,8 +30,6 @@ queue() {
 
 queue sac
 queue etl
-[ -d "runs/oracles/body-$task" ] ||
-  $python studies/body_synergies.py "$task" "runs/oracles/body-$task"
 queue etl_body
 [ -d "runs/oracles/body_shuffled-$task" ] ||
   $python studies/body_synergies.py "$task" "runs/oracles/body_shuffled-$task" --shuffle 0

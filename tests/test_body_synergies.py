@@ -1,4 +1,4 @@
-"""The scripts that lay synergies beside a body's moment arms."""
+"""Synergies of a body's moment arms, and the scripts that lay others beside them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,22 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from studies.body_synergies import body_decoder, muscle_changes
 from tests.commands import script
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis import joint_effects
-from torchrl_etl.envs import actuator_names, excitation, joint_torques, make_env
+from torchrl_etl.envs import (
+    actuator_names,
+    body_decoder,
+    body_synergies,
+    excitation,
+    joint_torques,
+    make_env,
+    muscle_changes,
+)
+from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import load_bundle, save_bundle
+from torchrl_etl.training import resumed_config
 
 TASK = "myoHandKeyTurn"
 
@@ -37,7 +46,7 @@ def test_fewer_synergies_are_what_muscles_turn_most():
     torques = np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 0.0], [0.0, 0.0, 9.0]])
     (change,) = muscle_changes(torques, 1)
     assert np.abs(change) == pytest.approx([1.0, 1.0, 0.0])
-    with pytest.raises(ValueError, match="--num-synergies is 4, but muscles turn 3 joints"):
+    with pytest.raises(ValueError, match="num_synergies is 4, but muscles turn 3 joints"):
         muscle_changes(torques, 4)
 
 
@@ -94,3 +103,27 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
     for row in rows:
         assert float(row["shuffled"]) == pytest.approx(float(row["chance"]), abs=0.05)
         assert 0 < float(row["shuffled_sd"]) < 0.2  # two dimensions scatter by 0.1
+
+
+def test_a_run_takes_the_synergies_of_its_body_and_goes_on_with_them(tmp_path):
+    run = tmp_path / "run"
+    made = tiny(f"env={TASK}", "method=etl_body", "learn.frames=192", f"run_dir={run}")
+    made.num_synergies = None
+    assert Experiment(made).run()["learn"]["frames"] == 192
+    decoder, info = load_bundle(run)
+    env = make_env(TASK, seed=0)
+    env.reset()
+    synergies = torch.rand(5, 23)
+    assert torch.equal(decoder.module(synergies), body_synergies(env).module(synergies))
+    assert (info.kind, info.facts["frames"]) == ("body", 0)
+    config = resumed_config(run, ["learn.frames=256"])
+    assert Experiment(config, resume=run).run()["learn"]["frames"] == 256
+
+
+@pytest.mark.parametrize(
+    ("env", "words"), [("overactuated", "MuJoCo"), ("humanoid-stand", "moved by muscles alone")]
+)
+def test_a_body_without_muscles_has_no_synergies_of_its_own(env, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
+        Experiment(tiny(f"env={env}", "synergies.bundle=body", f"run_dir={tmp_path / 'run'}"))
+    assert not (tmp_path / "run").exists()

@@ -31,7 +31,7 @@ RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.en
 def test_a_file_names_itself_and_makes_stages(method, tmp_path):
     made = tiny(f"method={method}", "run_dir=unused", ELBOW)
     assert made.method.name == method
-    if made.synergies.bundle is not None:  # such as one of studies/body_synergies.py
+    if made.synergies.bundle is not None:  # of the body, or made by a script of studies/
         spec = EnvironmentSpec.of(make_env(made.env))
         bounds = {"low": spec.low.tolist(), "high": spec.high.tolist()}
         decoder = SynergyDecoder(2, spec.action_dim, hidden=(8,), **bounds)

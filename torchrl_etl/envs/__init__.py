@@ -4,6 +4,7 @@ import gymnasium
 
 from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.envs.body import body_joints, has_free_root
+from torchrl_etl.envs.body_synergies import body_decoder, body_synergies, muscle_changes
 from torchrl_etl.envs.factory import actuator_names, make_env
 from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
 from torchrl_etl.envs.simulator import mujoco_state
@@ -20,7 +21,9 @@ __all__ = [
     "SynergyActionWrapper",
     "Task",
     "actuator_names",
+    "body_decoder",
     "body_joints",
+    "body_synergies",
     "episode_length",
     "excitation",
     "has_free_root",
@@ -28,6 +31,7 @@ __all__ = [
     "list_tasks",
     "make_env",
     "mujoco_state",
+    "muscle_changes",
     "resolve_task",
 ]
 

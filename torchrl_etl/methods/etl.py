@@ -14,7 +14,7 @@ from torchrl.data import Bounded
 from torchrl_etl import zoo
 from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real, naming, renaming
-from torchrl_etl.envs import resolve_task
+from torchrl_etl.envs import body_synergies, resolve_task
 from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term, entropy_target
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
@@ -38,6 +38,8 @@ from torchrl_etl.training.work import Work
 __all__ = ["ETL", "FineTuning"]
 
 FineTuning = Literal["critic", "reconstruction", "frozen"]
+BODY = "body"
+"""What ``synergies=`` calls those that a body's moment arms give."""
 MOST_SYNERGIES = 8
 """d of bodies with at least twice as many actuators, among them all of the paper's tasks."""
 
@@ -61,6 +63,8 @@ def bundle_path(given: str) -> Path:
 class ETL(Method):
     """Algorithm 1: explore and condense, or take a bundle; then SAC on synergy coefficients.
 
+    The bundle is one of another run, of the zoo, or of the body's moment arms.
+
     The decoder is fine-tuned in one of three ways: ``"critic"`` (the actor loss runs through it,
     Eq. 10 with ``distillation_weight`` keeps it from drifting), ``"reconstruction"`` (Eq. 10 alone,
     as printed) or ``"frozen"``.
@@ -80,7 +84,7 @@ class ETL(Method):
         if config.stage == "learn" and not self.given:
             raise ValueError(
                 "stage=learn needs synergies=PATH, the run folder or bundle of an earlier "
-                "exploration; use stage=all to explore first."
+                "exploration, or synergies=body; use stage=all to explore first."
             )
         if config.stage == "explore" and self.given:
             raise ValueError(
@@ -89,14 +93,27 @@ class ETL(Method):
             )
         with naming("learn.decoder"):
             check_real("[0, 1]", residual=config.learn.decoder.residual)
+        self.of_body: SynergyDecoder | None = None
         if self.given:
-            # The absolute path stands in the run's configuration.
-            config.synergies.bundle = str(bundle_path(config.synergies.bundle))
-            _, info = load_bundle(self.bundle)
-            config.num_synergies = info.num_synergies
-            space = context.spec
-            check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
+            self._settle_given()
         self._settle_num_synergies()
+
+    def _settle_given(self) -> None:
+        """Look at the synergies that were given; those of the body are made, once in a run."""
+        config, space = self.context.config, self.context.spec
+        if config.synergies.bundle == BODY:
+            if not surviving_folder(self.context.folder.synergies).exists():
+                env = self.context.make_env(seed=0)
+                env.reset()
+                self.of_body = body_synergies(env, config.num_synergies)
+                config.num_synergies = self.of_body.num_synergies
+                env.close()
+                return
+        else:  # the absolute path stands in the run's configuration
+            config.synergies.bundle = str(bundle_path(config.synergies.bundle))
+        _, info = load_bundle(self.bundle)
+        config.num_synergies = info.num_synergies
+        check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
 
     def _settle_num_synergies(self) -> None:
         """Without a number, take one for the body; refuse more synergies than actuators."""
@@ -151,7 +168,9 @@ class ETL(Method):
         return Path(given)
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
-        if self.given:  # a run holds all it needs, wherever it is moved
+        if self.of_body is not None:
+            self._save(self.of_body, BODY, frames=0)
+        elif self.given:  # a run holds all it needs, wherever it is moved
             copy_bundle(self.bundle, self.context.folder.synergies)
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             yield from self._explore(stop)
@@ -178,13 +197,18 @@ class ETL(Method):
             rows = explorer.transitions(decoder).flatten_keys(".").cpu()
             tensors = {key: value.contiguous() for key, value in rows.items()}
             write_atomically(context.folder.explored, safetensors.torch.save(tensors))
+        self._save(decoder, explorer.model.kind, **numbers, seed=context.config.seed)
+
+    def _save(self, decoder: SynergyDecoder, kind: str, **known: Any) -> None:
+        """Leave the bundle of this run in its folder."""
+        config = self.context.config
         save_bundle(
             decoder,
-            context.folder.synergies,
-            task=resolve_task(context.config.env, context.config.goal).env_id,
-            actuators=context.spec.actuators,
-            kind=explorer.model.kind,
-            facts={**numbers, "seed": context.config.seed, **facts()},
+            self.context.folder.synergies,
+            task=resolve_task(config.env, config.goal).env_id,
+            actuators=self.context.spec.actuators,
+            kind=kind,
+            facts={**known, **facts()},
         )
 
     def _draw(self, explorer: Explorer, decoder: SynergyDecoder, stop: StopOnSignal) -> None:
@@ -216,8 +240,9 @@ class ETL(Method):
     # Stage 2 -----------------------------------------------------------------------------------
 
     def decoder(self) -> SynergyDecoder | None:
-        """The decoder that was given or explored, if it is there by now."""
-        if self.given or surviving_folder(self.context.folder.synergies).exists():
+        """The decoder that was given, explored or made, if it is there by now."""
+        there = self.given and self.of_body is None
+        if there or surviving_folder(self.context.folder.synergies).exists():
             return self._load()[0]
         return None
 
