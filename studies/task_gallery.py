@@ -94,9 +94,8 @@ def recorder_of(env: EnvBase, name: str) -> EpisodeRecorder:
 
 
 def simplify(env: EnvBase) -> None:
-    """No zones that hide fingers, and ground in one colour: a pattern is most of a file."""
+    """Ground in one colour: a pattern is most of a file."""
     model, _ = mujoco_state(env)
-    model.site_rgba[model.site_size.max(1) > 0.05, 3] *= 0.3
     if not has_free_root(env):  # which resets, and so raises terrain
         return  # the recorder leaves floors out
     floor, terrain = planes(model), model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)

@@ -19,7 +19,7 @@ import torch
 
 from tests.commands import command
 from tests.configs import ROOT, TINY
-from torchrl_etl.command_line import quote_paths
+from torchrl_etl.command_line import print_intervals, quote_paths
 from torchrl_etl.synergies import load_bundle, save_bundle
 
 SMALL = [override for override in TINY if not override.startswith("env=")]
@@ -92,6 +92,11 @@ def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, cap
 
 
 @pytest.mark.slow
+def test_one_episode_is_told_without_an_interval(capsys):
+    print_intervals({"return": {"mean": 2.0, "low": float("nan"), "high": float("nan")}})
+    assert capsys.readouterr().out == "  return       2.000\n"
+
+
 def test_evaluate_draws_a_video_or_says_what_to_install(hand):
     done = process(
         "evaluate.py",

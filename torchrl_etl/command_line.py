@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import math
 import os
 import sys
 import textwrap
@@ -166,7 +167,9 @@ def print_intervals(summary: Mapping[str, Any]) -> None:
     for key in ("return", "solved", "solved_time"):
         if key in summary:
             mean, low, high = summary[key].values()
-            print(f"  {key:<12} {mean:.3f}  (95% interval {low:.3f} to {high:.3f})")
+            known = not math.isnan(low)  # one episode alone has no interval
+            interval = f"  (95% interval {low:.3f} to {high:.3f})" if known else ""
+            print(f"  {key:<12} {mean:.3f}{interval}")
 
 
 def quiet_torchrl() -> None:

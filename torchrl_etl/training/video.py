@@ -19,6 +19,7 @@ from torchrl_etl.training.evaluation import EVALUATION_SEED
 
 __all__ = ["EpisodeRecorder", "check_video_size"]
 
+_FINGER = 0.05  # m
 _BACKDROP = [0.93, 0.94, 0.96, 1.0]
 _MOST_PIXELS = 4096  # in either direction: what decoders of MP4 can be relied on to show
 
@@ -128,6 +129,8 @@ class EpisodeRecorder:
         if camera is None:
             around = scenery(model) | (planes(model) & (not self._follows))
             model.geom_group[around] = SHOWN_GROUPS  # the first that are not
+            zones = model.site_size.max(1) > _FINGER  # which would hide a hand
+            model.site_rgba[zones, 3] = model.site_rgba[zones, 3].clip(max=0.15)
             light = model.vis.headlight  # the room's lamps leave with the room
             light.active, light.ambient[:], light.diffuse[:] = 1, 0.4, 0.5
 
