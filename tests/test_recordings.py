@@ -63,9 +63,15 @@ def test_arrays_of_numpy_are_read_in_every_form(tmp_path):
     ("text", "words"),
     [
         ("a,b\n1,2\n3\n", "Line 3 of .* has 1 entries and the first line 2"),
-        ("a,b\n1,2\n3,\n5,6\n", "'b' in .* has no value in row 1; fill"),
-        ("a,b\n1,2\nNaN,3\n5,NA\n", "'a' in .* no value in row 1, one of 2 such places"),
-        ("a,b\n1,2\nx,3\n", "Row 1 of 'a' in .* is 'x', not a number"),
+        ("a,b\n1,2\n3,\n5,6\n", "'b' in .* has no value in line 3; fill"),
+        ("a,b\n1,2\nNaN,3\n5,NA\n", "'a' in .* no value in line 3, one of 2 such places"),
+        ("a,b\n1,2\n\n\nNaN,3\n5,6\n", "'a' in .* has no value in line 5;"),
+        ('"a","b\n(mV)"\n1,2\nx,3\n', "'a' in .* has 'x', not a number, in line 4"),
+        ("a,b\n1,2\nx,3\n", "'a' in .* has 'x', not a number, in line 3; .*leave_out=\\[a\\]"),
+        ("a;b\n0,5;0,6\n", "'a' in .* decimal comma in line 2; .*0.5 in place of 0,5"),
+        ("a\tb\n1\t2\n1\t-,5e-3\n", "'b' in .* decimal comma in line 3; .*-.5e-3 in place of"),
+        ('a,b\n1,2\n"3,4\n5,6\n', "Line 3 of .* has quotation marks that do not pair up"),
+        ('a,b\n1,2\n3,"4\n' + "5,6\n" * 50_000, "Line 3 of .*emg.csv .*larger than field limit"),
         ("a,b\n1,2\n1,3\n", "'a' in .* has the same value in every row; .*leave_out=\\[a\\]"),
         ("a,a\n1,2\n2,3\n", "2 columns 'a'"),
         ("1,2\n3,4\n", "names no columns"),
@@ -87,6 +93,7 @@ def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
     np.savez(tmp_path / "two.npz", a=np.zeros((2, 3)), b=np.zeros((2, 3)))
     np.savez(tmp_path / "ragged.npz", a=np.arange(3), b=np.arange(4))
     np.savez(tmp_path / "names.npz", a=emg(4), names=np.array(["x"]))
+    np.savez(tmp_path / "gap.npz", a=np.array([1.0, np.nan]), b=np.arange(2))
     np.savez(tmp_path / "text.npz", a=np.array(["x", "y"]), b=np.arange(2))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "two.npz").read_bytes()[:200])
     (tmp_path / "latin.csv").write_bytes("a,\xe4\n1,2\n".encode("latin-1"))
@@ -97,6 +104,7 @@ def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
         "two.npz": "has the arrays a, b; keep the one",
         "ragged.npz": "3 and 4 rows",
         "names.npz": "1 names for the 6 columns",
+        "gap.npz": "'a' in .* has no value in row 1;",
         "text.npz": "'a' in .* of type",
         "cut.npz": "does not hold arrays of numbers",
         "latin.csv": "not a text in UTF-8",

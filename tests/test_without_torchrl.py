@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import warnings
 
@@ -112,18 +113,25 @@ def test_a_policy_function_is_the_policy_without_noise():
         policy_function(actor, action_key="synergy")
 
 
+def blocks() -> tuple[str, str, str]:
+    """What the page does with a policy, with synergies, and with Stable-Baselines3."""
+    policy, synergies, agent = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
+    assert "stable_baselines3" in agent
+    return policy, synergies, agent
+
+
 def test_the_page_runs_with_stable_baselines3_among_the_peers(tmp_path):
     if not PEERS.exists():
         pytest.skip("Stable-Baselines3 is not installed; make .venv-peers/.complete installs it.")
-    blocks = [block[1] for block in BLOCK.finditer(PAGE.read_text(encoding="utf-8"))]
-    assert len(blocks) == 2 and "stable_baselines3" in blocks[1]
     environ = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [str(PEERS), "-c", "\n".join(blocks)]
+    command = [str(PEERS), "-c", "\n".join(blocks())]
     done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-def test_the_gymnasium_part_of_the_page_runs_here(tmp_path, monkeypatch):
+def test_the_gymnasium_part_of_the_page_runs_here_and_names_no_torchrl(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    block = next(BLOCK.finditer(PAGE.read_text(encoding="utf-8")))
-    exec(compile(block[1], str(PAGE), "exec"), {"__name__": "__main__"})
+    block = "\n".join(blocks()[:2])
+    exec(compile(block, str(PAGE), "exec"), {"__name__": "__main__"})
+    assert not re.search(r"(import|from) (torchrl|tensordict)\b(?!_)", block)
+    assert not any(tmp_path.iterdir())

@@ -16,15 +16,15 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.commands import command
-from tests.configs import BRIEFLY, CONF, ELBOW, tiny
+from tests.configs import BRIEFLY, CONF, ELBOW, ROOT, tiny
 from torchrl_etl import zoo
 from torchrl_etl.command_line import translate
-from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.export import command_of, describe_policy, export_run, rebuilt
 from torchrl_etl.opened import open_zoo
 from torchrl_etl.synergies import check_compatible, load_bundle
-from torchrl_etl.training import evaluate_task, resumed_config
+from torchrl_etl.training import Evaluation, evaluate_task, resumed_config, validate
 from torchrl_etl.zoo import ZooError
 
 
@@ -89,6 +89,41 @@ def test_every_entry_repeats_the_numbers_of_its_card(name):
     assert "dirty" not in card.training["commit"]
     for word in ("/tmp", "/home", "run_dir"):
         assert word not in card.json
+
+
+@pytest.mark.parametrize("name", zoo.names(trained=True))
+def test_the_intervals_of_a_card_are_those_of_its_episodes(name):
+    told = zoo.read_card(name).evaluation
+    found = Evaluation(**told["episodes"]).summary()
+    assert found.keys() == told.keys()
+    for key in told.keys() - {"episodes", "first_seed"}:
+        assert told[key] == pytest.approx(found[key], nan_ok=True), key
+    returns, solved = told["episodes"]["returns"], told["episodes"]["successes"]
+    assert told["return"]["mean"] == pytest.approx(sum(returns) / len(returns))
+    assert told["solved"]["mean"] == pytest.approx(sum(solved) / len(solved))
+
+
+@pytest.mark.parametrize("name", zoo.names(trained=True))
+def test_the_command_of_a_card_is_one_of_today_for_its_task(name):
+    card = zoo.read_card(name)
+    told = shlex.split(card.training["command"])
+    config = composed(translate([*told[2:], "run_dir=unused"], CONF))
+    validate(config)
+    assert told[:2] == ["python", "recipes/etl_sac.py"]
+    assert resolve_task(config.env, config.goal) == resolve_task(
+        card.task["name"], card.task["goal"]
+    )
+
+
+def test_the_page_tells_how_the_synergies_of_the_hand_were_made():
+    info = json.loads((zoo.synergies("myohand") / "synergies.json").read_text("utf-8"))
+    page = (ROOT / "docs" / "zoo.md").read_text(encoding="utf-8")
+    (told,) = (line for line in page.splitlines() if line.startswith("`myohand` was explored"))
+    facts = info["facts"]
+    assert f"commit {facts['commit'][:7]} with seed {facts['seed']}: {facts['frames']:,} fr" in told
+    assert f"{info['num_synergies']} synergies, {info['num_components']} components" in told
+    for key in ("vaf", "pca_vaf", "nmf_vaf", "control_authority"):
+        assert f"{facts[key]:.3f}" in told, key
 
 
 def test_an_entry_holds_the_run_s_own_policy_and_bundle(run, exported):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import numpy as np
 __all__ = ["Recording", "read_recording"]
 
 _MISSING = ("", "na", "n/a", "nan", "null", "none", "-")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.IGNORECASE)
 
 
 class Recording(NamedTuple):
@@ -55,8 +57,9 @@ def read_recording(
 
     Raises:
         OSError: if the file cannot be read.
-        ValueError: if it is of another kind, has rows of different lengths, missing values, a
-            muscle that never varies, or names twice.
+        ValueError: if it is of another kind, has rows of different lengths, missing values, decimal
+            commas, a muscle that never varies, or names twice. Rows are told by the line of a
+            ``.csv`` file, by their index from 0 in an array.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -75,7 +78,7 @@ def read_recording(
         )
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}; pass the path of a recording.")
-    columns = readers[path.suffix.lower()](path)
+    columns, lines = readers[path.suffix.lower()](path)
     for name in (named := Counter(name for name, _ in columns)):
         if named[name] > 1:
             raise ValueError(f"{path} has {named[name]} columns {name!r}; give each its own name.")
@@ -87,42 +90,62 @@ def read_recording(
     columns = [(name, c) for name, c in columns if name != trial and name not in leave_out]
     if not columns:
         raise ValueError(f"{path} has no column that is a muscle; pass a file that has some.")
-    activity = np.stack([_numbers(path, name, column) for name, column in columns], -1)
+    activity = np.stack([_numbers(path, name, column, lines) for name, column in columns], -1)
     muscles = tuple(name for name, _ in columns)
-    _check(path, muscles, activity)
+    _check(path, muscles, activity, lines)
     return Recording(muscles, activity, trials)
 
 
 Columns = list[tuple[str, "np.ndarray | list[str]"]]
+# The line of the file that each row begins on; arrays have none.
+Lines = list[int] | None
 
 
-def _read_csv(path: Path) -> Columns:
+def _read_csv(path: Path) -> tuple[Columns, Lines]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not a text in UTF-8 ({error.reason}); save it so.") from error
     head = lines[0] if lines else ""
-    rows = list(csv.reader(lines, delimiter=max(",;\t", key=head.count)))
-    names = [name.strip() for name in rows[0]] if rows else []
+    rows = _rows(path, lines, max(",;\t", key=head.count))
+    names = [name.strip() for name in rows[0][1]] if rows else []
     if not any(names) or all(map(_is_number, names)):
         raise ValueError(
             f"The first line of {path} names no columns; write the name of each muscle there."
         )
-    rows = [(number, row) for number, row in enumerate(rows[1:], 2) if row]
+    rows = [(number, row) for number, row in rows[1:] if row]
     for number, row in rows:
         if len(row) != len(names):
             raise ValueError(
                 f"Line {number} of {path} has {len(row)} entries and the first line {len(names)}; "
                 "complete it or leave it out."
             )
-    return [(name, [row[i].strip() for _, row in rows]) for i, name in enumerate(names)]
+    columns = [(name, [row[i].strip() for _, row in rows]) for i, name in enumerate(names)]
+    return columns, [number for number, _ in rows]
 
 
-def _read_npy(path: Path) -> Columns:
-    return _columns(path, _load(path))
+def _rows(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[str]]]:
+    """The rows of a table, each with the line that it begins on, from 1 up."""
+    # Strict, or a quotation mark without a second one swallows the rest of the file.
+    reader = csv.reader(lines, delimiter=delimiter, strict=True)
+    rows, first = [], 1
+    try:
+        for row in reader:
+            rows.append((first, row))
+            first = reader.line_num + 1
+    except csv.Error as error:
+        raise ValueError(
+            f"Line {first} of {path} has quotation marks that do not pair up ({error}); numbers "
+            "need none, and a name one at each end."
+        ) from error
+    return rows
 
 
-def _read_npz(path: Path) -> Columns:
+def _read_npy(path: Path) -> tuple[Columns, Lines]:
+    return _columns(path, _load(path)), None
+
+
+def _read_npz(path: Path) -> tuple[Columns, Lines]:
     archive = _load(path)
     matrices = [name for name, array in archive.items() if array.ndim == 2]
     if not matrices:
@@ -132,7 +155,7 @@ def _read_npz(path: Path) -> Columns:
                 f"The arrays of {path} have {' and '.join(map(str, sorted(lengths)))} rows; they "
                 "must have as many as each other."
             )
-        return columns
+        return columns, None
     if len(matrices) > 1:
         raise ValueError(
             f"{path} has the arrays {', '.join(matrices)}; keep the one that holds a column for "
@@ -146,7 +169,7 @@ def _read_npz(path: Path) -> Columns:
             "pass one for each."
         )
     beside = [pair for pair in archive.items() if pair[1].shape == matrix.shape[:1]]
-    return _columns(path, matrix, names) + beside
+    return _columns(path, matrix, names) + beside, None
 
 
 def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
@@ -175,15 +198,21 @@ def _columns(path: Path, array: np.ndarray, names: np.ndarray | None = None) -> 
     return list(zip(named, array.T, strict=True))
 
 
-def _numbers(path: Path, name: str, column: np.ndarray | list[str]) -> np.ndarray:
+def _numbers(path: Path, name: str, column: np.ndarray | list[str], lines: Lines) -> np.ndarray:
     """A column in double precision; what is missing is NaN."""
     if isinstance(column, list):
         column = ["nan" if entry.lower() in _MISSING else entry for entry in column]
         wrong = next((i for i, entry in enumerate(column) if not _is_number(entry)), None)
+        if wrong is not None and _DECIMAL_COMMA.fullmatch(entry := column[wrong]):
+            raise ValueError(
+                f"{name!r} in {path} has a decimal comma in {_place(lines, wrong)}; write points "
+                f"in all numbers of the file, {entry.replace(',', '.')} in place of {entry}."
+            )
         if wrong is not None:
             raise ValueError(
-                f"Row {wrong} of {name!r} in {path} is {column[wrong]!r}, not a number; if it is "
-                f"not a muscle, leave it out with leave_out=[{name}]."
+                f"{name!r} in {path} has {column[wrong]!r}, not a number, in "
+                f"{_place(lines, wrong)}; if it is not a muscle, leave it out with "
+                f"leave_out=[{name}]."
             )
     elif column.dtype.kind not in "fiub":
         raise ValueError(
@@ -201,7 +230,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _check(path: Path, muscles: Sequence[str], activity: np.ndarray) -> None:
+def _place(lines: Lines, row: int) -> str:
+    """Where a person finds a row."""
+    return f"row {row}" if lines is None else f"line {lines[row]}"
+
+
+def _check(path: Path, muscles: Sequence[str], activity: np.ndarray, lines: Lines) -> None:
     if len(activity) < 2:
         raise ValueError(
             f"{path} has {len(activity)} row(s), in which no synergies can be found; record more."
@@ -210,8 +244,8 @@ def _check(path: Path, muscles: Sequence[str], activity: np.ndarray) -> None:
     if rows.size:
         more = f", one of {rows.size} such places" if rows.size > 1 else ""
         raise ValueError(
-            f"{muscles[columns[0]]!r} in {path} has no value in row {rows[0]}{more}; fill what is "
-            "missing or leave these rows out."
+            f"{muscles[columns[0]]!r} in {path} has no value in {_place(lines, rows[0])}{more}; "
+            "fill what is missing or leave these rows out."
         )
     constant = [
         name for name, still in zip(muscles, np.ptp(activity, 0) == 0, strict=True) if still
