@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium
 import hydra
 from omegaconf import DictConfig
 
@@ -35,7 +36,7 @@ from torchrl_etl.command_line import (
     quiet_torchrl,
     quote_paths,
 )
-from torchrl_etl.envs import resolve_task
+from torchrl_etl.envs import SimulationError, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.io import as_json, write_atomically
 from torchrl_etl.training import (
@@ -52,7 +53,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError, ImportError):
+    with one_sentence(ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error):
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)
@@ -83,7 +84,7 @@ def main(config: DictConfig) -> None:
         print(f"  {beside(trained.card, evaluation)}")
     print(f"  written to {path}")
     if recorder is not None:
-        with one_sentence(OSError), recorder:
+        with one_sentence(OSError, SimulationError), recorder:
             videos = draw_episodes(config, trained, recorder)
         print("  videos  " + ", ".join(str(video) for video in videos))
 

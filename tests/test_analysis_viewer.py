@@ -160,6 +160,22 @@ def test_another_goal_begins_anew_in_a_simulator_of_its_own():
         session.choose_goal("near")
 
 
+def test_a_goal_that_cannot_be_built_leaves_the_simulator_before():
+    session = open_session()
+
+    def make(goal):
+        if goal == "random":
+            raise ValueError("no such simulator")
+        return make_env("overactuated", goal=goal)
+
+    session = Session(replace(session.subject, make_env=make))
+    session.step()
+    with pytest.raises(ValueError, match="no such simulator"):
+        session.choose_goal("random")
+    session.step()
+    assert session.goal == "fixed" and session.steps == 2 and not session.env.is_closed
+
+
 def test_what_nothing_can_move_is_refused():
     with pytest.raises(ValueError, match="neither a policy nor synergies"):
         open_session(decoder=None)

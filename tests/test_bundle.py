@@ -126,6 +126,7 @@ DAMAGE = {
     r"lacks \['task'\]": lambda f: edit(f, task=None),
     r"the unknown \['surprise'\]": lambda f: edit(f, surprise=1),
     "'x' as low where a JSON array belongs": lambda f: edit(f, low="x"),
+    "5 as task where a JSON string belongs": lambda f: edit(f, task=5),
     "do not make a SynergyDecoder": widen,
     "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
     "states 1 actuators": lambda f: edit(f, actuators=["biceps"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
@@ -10,20 +11,21 @@ import subprocess
 import sys
 from urllib.request import urlopen
 
+import gymnasium
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from tests.commands import recipe_module
+from tests.commands import command, recipe_module
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.analysis.viewer.page import Page, check_port
-from torchrl_etl.envs import actuator_names
+from torchrl_etl.envs import SimulationError, actuator_names
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.opened import open_bundle, open_run, open_zoo
 from torchrl_etl.synergies import BundleError, save_bundle
-from torchrl_etl.zoo import read_card
+from torchrl_etl.zoo import ZooError, read_card
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +106,59 @@ def test_an_entry_of_the_zoo_has_the_returns_of_its_card():
     assert session.total_reward == pytest.approx(card["episodes"]["returns"][0], rel=1e-4)
 
 
+def test_an_entry_s_synergies_are_shown_with_either_goal():
+    with Session(open_zoo("myohand")) as session:
+        for goal in ("random", "fixed"):
+            session.choose_goal(goal)
+            session.step()
+            assert session.goal == goal and session.steps == 1
+
+
+def test_what_was_made_on_an_id_is_shown_with_either_goal(tmp_path):
+    made_on = "env=torchrl_etl/OveractuatedRandom-v0"
+    short = ("explore.frames=128", "learn.frames=128", "evaluation.episodes=2")
+    Experiment(tiny(f"run_dir='{tmp_path}/run'", made_on, *short)).run()
+    for subject in (open_run(tmp_path / "run"), open_bundle(tmp_path / "run")):
+        with Session(subject) as session:
+            assert session.goal == "random"
+            session.choose_goal("fixed")
+            session.step()
+
+
+def test_a_folder_of_synergies_alone_is_an_entry_by_its_path(finished, tmp_path):
+    folder = shutil.copytree(finished / "synergies", tmp_path / "hand")
+    assert open_zoo(str(folder)).drivers == ["sliders"]
+    (folder / "synergies.safetensors").unlink()
+    with pytest.raises(ZooError, match="no entry of the zoo"):
+        open_zoo(str(folder))
+
+
+def test_a_bundle_does_not_get_to_import_a_module(finished, tmp_path):
+    folder = shutil.copytree(finished / "synergies", tmp_path / "foreign")
+    info = json.loads((folder / "synergies.json").read_text())
+    info["task"] = "antigravity:T-v0"
+    (folder / "synergies.json").write_text(json.dumps(info))
+    with pytest.raises(BundleError, match=r"does not get to import .*; pass env=\S+ yourself"):
+        open_bundle(folder)
+    assert "antigravity" not in sys.modules
+    assert open_bundle(folder, "overactuated").task.name == "overactuated"
+
+
+@pytest.mark.parametrize("fault", [SimulationError, gymnasium.error.DependencyNotInstalled])
+@pytest.mark.parametrize(
+    ("recipe", "opening"),
+    [("view.py", "torchrl_etl.opened.open_zoo"), ("evaluate.py", "torchrl_etl.zoo.load")],
+)
+def test_a_simulator_s_fault_is_one_sentence(recipe, opening, fault, monkeypatch, capsys):
+    def fail(*arguments, **options):
+        raise fault("the simulator says why")
+
+    monkeypatch.setattr(opening, fail)
+    port = ["port=0"] if recipe == "view.py" else []
+    assert command(recipe, "zoo=overactuated", *port) == 2
+    assert capsys.readouterr().err == "Error: the simulator says why\n"
+
+
 def test_a_bundle_of_another_body_is_refused(finished):
     with pytest.raises(BundleError, match="it is for another body"):
         open_bundle(finished, "humanoid-stand")
@@ -126,6 +181,12 @@ def test_a_busy_port_is_refused_and_another_one_proposed():
 def test_what_is_no_port_is_refused(port):
     with pytest.raises(ValueError, match=r"from 0 .* to 65535"):
         check_port("127.0.0.1", port)
+
+
+@pytest.mark.parametrize("host", [None, 1, ""])
+def test_what_is_no_host_is_refused(host):
+    with pytest.raises(ValueError, match="it must be an address to listen on"):
+        check_port(host, 0)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -15,7 +14,8 @@ from torchrl_etl.analysis.viewer import Subject
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyMap
-from torchrl_etl.synergies import check_compatible, load_bundle
+from torchrl_etl.own_code import check_imported
+from torchrl_etl.synergies import BundleError, check_compatible, load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import EVALUATION_SEED, longest_episode
 from torchrl_etl.training.resumed import resumed_config
@@ -36,11 +36,11 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
         ValueError: if the folder holds no run, or nothing yet that would move a body.
     """
     experiment = Experiment(resumed_config(run, ["device=cpu"], defaults=defaults), resume=run)
-    context = experiment.context
+    context, task = experiment.context, experiment.task
     subject = Subject(
         str(run),
-        experiment.task,
-        lambda goal: context.make_env(goal=goal),
+        task,
+        lambda goal: context.make_env(name=task.name, goal=goal),  # an id would name one goal
         context.spec.actuators,
         episode_steps=math.ceil(longest_episode(context.task) / context.config.action_repeat),
         first_seed=EVALUATION_SEED,
@@ -57,6 +57,9 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
 def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None) -> Subject:
     """The synergies of a bundle on a body.
 
+    A bundle holds no code, so the task that it names is not imported: pass one of a module of your
+    own as ``env``.
+
     Args:
         bundle (path): the bundle's folder, or a run folder.
         env (str, optional): a task of the body. Default: the one that the bundle was explored on.
@@ -65,18 +68,22 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
         goal (str, optional): see :func:`~torchrl_etl.envs.resolve_task`.
 
     Raises:
-        BundleError: if there is no bundle, or it is of another body.
+        BundleError: if there is no bundle, it is of another body, or its task is one of a module
+            that has not been imported.
         ValueError: if there is no such task.
     """
     decoder, info = load_bundle(bundle, residual=0.0)
-    task = resolve_task(env or info.task, goal)
-    make = partial(make_env, env or info.task)
-    spec = EnvironmentSpec.of(make(goal=goal))
+    if env is None:
+        remedy = f"pass env={info.task} yourself if you trust it"
+        check_imported(info.task, f"The task of {bundle}", BundleError, remedy)
+        env = info.task
+    task = resolve_task(env, goal)
+    spec = EnvironmentSpec.of(make_env(env, goal=goal))
     check_compatible(info, spec.actuators, spec.low, spec.high)
     return Subject(
         str(bundle),
         task,
-        lambda goal: make(goal=goal),
+        lambda goal: make_env(task.name, goal=goal),
         spec.actuators,
         decoder=decoder,
         episode_steps=task.episode_steps,
@@ -93,24 +100,25 @@ def open_zoo(name: str) -> Subject:
         name (str): an entry, see :func:`torchrl_etl.zoo.find`.
 
     Raises:
-        ZooError: if there is no such entry, or it is damaged.
+        ZooError: if there is no such entry, or its policy is damaged.
+        BundleError: if its synergies are, see :func:`open_bundle`.
 
     Examples:
         >>> from torchrl_etl.opened import open_zoo
         >>> open_zoo("overactuated").drivers[0]
         'policy'
     """
-    if name in zoo.names() and name not in zoo.names(trained=True):
+    if zoo.synergies_alone(name):
         return open_bundle(zoo.synergies(name))
     card = zoo.read_card(name)
     policy, env = zoo.load(name)
     env.close()
     of_task = dict(card.task)
-    built, goal = of_task.pop("name"), of_task.pop("goal", None)
+    task = resolve_task(of_task.pop("name"), of_task.pop("goal", None))
     return Subject(
         f"zoo={name}",
-        resolve_task(built, goal),
-        lambda goal: make_env(built, goal=goal, **of_task),
+        task,
+        lambda goal: make_env(task.name, goal=goal, **of_task),
         card.actuators,
         decoder=next((part for part in policy.modules() if isinstance(part, SynergyMap)), None),
         policy=policy,

@@ -11,9 +11,36 @@ from typing import TypeVar
 
 from torchrl_etl.checks import check_choice
 
-__all__ = ["find_class", "import_own"]
+__all__ = ["check_imported", "find_class", "import_own"]
 
 T = TypeVar("T")
+
+
+def check_imported(name: object, source: str, error: type[ValueError], remedy: str) -> None:
+    """Refuse a name out of a file that holds no code if a module would be imported for it.
+
+    Args:
+        name (str): ``"module:name"``, or a name for which nothing is imported.
+        source (str): what has this name, and in which file.
+        error (type): the exception to raise.
+        remedy (str): what a person can do who trusts the module.
+
+    Raises:
+        ValueError: of the given type, if the module has not been imported yet.
+
+    Examples:
+        >>> check_imported("fractions:Fraction", "The task of my_file", ValueError, "import it")
+        >>> check_imported("fractals:T-v0", "The task of my_file", ValueError, "import it")
+        Traceback (most recent call last):
+        ...
+        ValueError: The task of my_file is 'fractals:T-v0', and a file does not get to import
+        'fractals'; import it.
+    """
+    module = str(name).rpartition(":")[0]
+    if module and module not in sys.modules:
+        raise error(
+            f"{source} is {name!r}, and a file does not get to import {module!r}; {remedy}."
+        )
 
 
 def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T]:

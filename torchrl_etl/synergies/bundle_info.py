@@ -93,11 +93,12 @@ def read_description(folder: Path) -> BundleInfo:
             "bundle again."
         )
     kinds = {"actuators": list, "low": list, "high": list, "config": dict, "facts": dict}
-    for key, kind in kinds.items():
+    for key, kind in {"task": str, **kinds}.items():
         if not isinstance(content[key], kind):
+            named = {list: "array", dict: "object", str: "string"}[kind]
             raise BundleError(
-                f"{path} has {content[key]!r} as {key} where a JSON "
-                f"{'array' if kind is list else 'object'} belongs; copy the bundle again."
+                f"{path} has {content[key]!r} as {key} where a JSON {named} belongs; copy the "
+                "bundle again."
             )
     if version == 1:
         content["kind"] = default_kind(not content["config"].get("hidden", True))

@@ -15,6 +15,7 @@ from torchrl_etl.zoo.entry import (
     read_card,
     save_entry,
     synergies,
+    synergies_alone,
     untrained,
 )
 from torchrl_etl.zoo.policy import describe_decoder, make_policy
@@ -31,5 +32,6 @@ __all__ = [
     "read_card",
     "save_entry",
     "synergies",
+    "synergies_alone",
     "untrained",
 ]

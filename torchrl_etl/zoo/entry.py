@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +18,22 @@ from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.io import read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
+from torchrl_etl.own_code import check_imported
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
 from torchrl_etl.zoo.policy import make_policy
 
-__all__ = ["ENTRIES", "find", "load", "names", "read_card", "save_entry", "synergies", "untrained"]
+__all__ = [
+    "ENTRIES",
+    "find",
+    "load",
+    "names",
+    "read_card",
+    "save_entry",
+    "synergies",
+    "synergies_alone",
+    "untrained",
+]
 
 ENTRIES = Path(__file__).parent / "entries"
 """The folder of the entries that come with torchrl_etl."""
@@ -78,7 +88,7 @@ def read_card(name: str | os.PathLike[str]) -> Card:
     """
     folder = find(name)
     if not (folder / CARD).exists():
-        held = "synergies alone" if _holds_bundle(folder) else "no entry of the zoo"
+        held = "synergies alone" if synergies_alone(folder) else "no entry of the zoo"
         raise ZooError(
             f"{folder} holds {held}; pass an entry with a policy, of which {CARD} and {WEIGHTS} "
             "are parts."
@@ -171,6 +181,20 @@ def synergies(name: str | os.PathLike[str]) -> Path:
     return folder
 
 
+def synergies_alone(name: str | os.PathLike[str]) -> bool:
+    """Whether an entry is a synergy bundle without a policy.
+
+    Raises:
+        ZooError: if there is no such entry.
+
+    Examples:
+        >>> synergies_alone("myohand"), synergies_alone("overactuated")
+        (True, False)
+    """
+    folder = find(name)
+    return not (folder / CARD).exists() and _holds_bundle(folder)
+
+
 def save_entry(
     folder: str | os.PathLike[str],
     policy: TensorDictModuleBase,
@@ -255,13 +279,8 @@ def _fill(
 
 
 def _make_env(folder: Path, card: Card, device: torch.device | str | None) -> EnvBase:
-    name = str(card.task.get("name"))
-    module = name.rpartition(":")[0]
-    if module and module not in sys.modules:
-        raise ZooError(
-            f"The task of {folder} is {name!r}, and a file does not get to import {module!r}; "
-            "import it yourself first."
-        )
+    source = f"The task of {folder}"
+    check_imported(card.task.get("name"), source, ZooError, "import it yourself first")
     try:
         return make_env(**card.task, device=device)
     except (TypeError, ValueError) as error:

@@ -36,6 +36,11 @@ _NAMES = {"policy": "Trained policy", "sliders": "Sliders", "explorer": "Stage 1
 
 def check_port(host: str, port: int) -> None:
     """Raise a ``ValueError`` unless a server can listen there; viser would quietly take another."""
+    if not isinstance(host, str) or not host:  # an empty one would let everyone in
+        raise ValueError(
+            f"host is {host!r}; it must be an address to listen on, such as 127.0.0.1 (for this "
+            "machine alone) or 0.0.0.0 (for whoever reaches it)."
+        )
     if not isinstance(port, int) or isinstance(port, bool) or not 0 <= port <= 65535:
         raise ValueError(
             f"port is {port!r}; it must be a whole number from 0 (any free one) to 65535."
@@ -188,7 +193,7 @@ class Page:
         if len(session.subject.task.goals) > 1:
             goals = session.subject.task.goals
             goal = gui.add_dropdown("Goal", goals, initial_value=session.goal)
-            self._when(goal, self._choose_goal)
+            add["goal"] = self._when(goal, self._choose_goal)
         if session.has_residual:
             residual = gui.add_checkbox("Residual", True, hint="Muscles moved beside the synergies")
             self._when(residual, partial(setattr, session, "residual"))
@@ -201,7 +206,7 @@ class Page:
             add["activation"] = gui.add_html("")
 
     def _add_directions(self) -> None:
-        size = self.session.subject.direction_dim
+        gui, size = self.server.gui, self.session.subject.direction_dim
         axes = {
             f"{sign}{axis + 1}": torch.eye(size)[axis] * (1 if sign == "+" else -1)
             for axis in range(size)
@@ -209,12 +214,13 @@ class Page:
         }
 
         def choose(name: str) -> None:
-            self.session.follow(axes.get(name, torch.randn(size)))
+            self.session.follow(axes[name] if name in axes else torch.randn(size))
+            direction.value = name
 
-        direction = self.server.gui.add_dropdown(
-            "Direction", [*axes, "random"], hint="Along which stage 1's policy explores"
-        )
-        self._when(direction, choose)
+        hint = "Along which stage 1's policy explores"
+        direction = self._when(gui.add_dropdown("Direction", [*axes, "random"], hint=hint), choose)
+        # A menu tells of a change alone, so it would draw only once.
+        self._when(gui.add_button("Draw a direction"), lambda _: choose("random"))
 
     def _add_synergies(self) -> None:
         gui, session = self.server.gui, self.session
@@ -266,6 +272,8 @@ class Page:
             controls["activation"].content = activation_grid(names, active)
         controls["driver"].value = _NAMES[session.driver]
         controls["episode"].value = session.episode
+        if "goal" in controls:  # one that could not be built is not the session's
+            controls["goal"].value = session.goal
         controls["play"].label = "Pause" if session.playing else "Play"
         icon = viser.Icon.PLAYER_PAUSE if session.playing else viser.Icon.PLAYER_PLAY
         controls["play"].icon = icon

@@ -122,10 +122,10 @@ class Session:
         self.residual, self.hold = True, True
         self.playing, self.speed, self.episode = False, 1.0, 0
         self._budget = self._settling = 0.0
-        self._open(subject.task.goal)
+        self._enter(subject.make_env(subject.task.goal), subject.task.goal)
 
-    def _open(self, goal: str | None) -> None:
-        self.goal, self.env = goal, self.subject.make_env(goal)
+    def _enter(self, env: EnvBase, goal: str | None) -> None:
+        self.goal, self.env = goal, env
         try:
             self.model, self.data = mujoco_state(self.env)
         except ValueError:  # the analytic environment has no body
@@ -181,8 +181,9 @@ class Session:
             ValueError: if the task has no such goal.
         """
         check_choice("goal", goal, self.subject.task.goals)
+        env = self.subject.make_env(goal)  # if this fails, the simulator before goes on
         self.close()
-        self._open(goal)
+        self._enter(env, goal)
 
     def reset(self, episode: int | None = None) -> None:
         """Begin the present episode anew, or the one of this number."""

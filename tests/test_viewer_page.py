@@ -1,0 +1,92 @@
+"""The viewer's page without a browser: what its buttons ask for, and what becomes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from torchrl_etl.analysis.viewer import Session, Subject
+from torchrl_etl.analysis.viewer.page import Page
+from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
+from torchrl_etl.modules import SynergyDecoder
+
+SMALL = "cartpole-balance"
+
+
+def open_page(name: str, **parts) -> Page:
+    """A page of a task whose one synergy moves all actuators, on a port that is free."""
+    spec = EnvironmentSpec.of(make_env(name))
+    low, high = spec.low, spec.high
+    decoder = SynergyDecoder.from_directions(
+        (low + high) / 2, (high - low)[None] / 4, low=low.tolist(), high=high.tolist()
+    )
+    make = lambda goal: make_env(name)  # noqa: E731
+    subject = Subject("test", resolve_task(name), make, spec.actuators, decoder)
+    return Page(Session(replace(subject, **parts)), port=0)
+
+
+def by_a_person(page: Page, label: str, value: object = None) -> None:
+    """What viser does when a person in a browser uses the control with this label."""
+    handles = page.server.gui._gui_input_handle_from_uuid.values()
+    handle = next(handle for handle in handles if handle.label == label)
+    if value is not None:
+        handle.value = value
+    for callback in handle._impl.update_cb:
+        callback(SimpleNamespace(client=object(), target=handle))
+    page._shown_at = page._refreshed_at = 0.0  # so that what follows is shown at once
+    page.tick(0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["myo2HandPose", "myoLegStairTerrainWalk", "dog-run"])
+def test_a_slider_moves_a_body_that_is_drawn(name):
+    page = open_page(name)
+    try:
+        placed, shapes = page.body._placed.copy(), page.body._shapes
+        shades = {key: shape.batched_colors.copy() for key, shape in shapes.items()}
+        by_a_person(page, "1", 1.0)
+        assert page.session.steps > 0 and page.session.coefficients.tolist() == [1.0]
+        assert page.body._parts and np.isfinite(placed).all()
+        assert (page.body._placed != placed).any()
+        assert shades and any((shapes[key].batched_colors != shades[key]).any() for key in shades)
+    finally:
+        page.close()
+
+
+def test_a_random_direction_is_drawn_as_often_as_a_person_asks():
+    act = lambda observation, direction: observation.new_zeros(1)  # noqa: E731
+    explorer = TensorDictModule(act, ["observation", "direction"], ["action"])
+    page = open_page(SMALL, explorer=explorer, direction_dim=3)
+    try:
+        drawn = []
+        for _ in range(2):
+            by_a_person(page, "Draw a direction")
+            drawn.append(page.session.direction)
+        assert not torch.equal(*drawn)
+        by_a_person(page, "Direction", "−2")
+        assert page.session.direction.tolist() == [0.0, -1.0, 0.0]
+    finally:
+        page.close()
+
+
+def test_a_goal_that_cannot_be_built_is_told_and_the_menu_goes_back():
+    def make(goal):
+        if goal == "random":
+            raise ValueError("no such simulator")
+        return make_env(SMALL)
+
+    both = replace(resolve_task(SMALL), random_id="another")
+    page = open_page(SMALL, task=both, make_env=make)
+    try:
+        by_a_person(page, "Goal", "random")
+        assert "no such simulator" in page._controls["message"].content
+        assert page._controls["goal"].value == "fixed"
+        by_a_person(page, "Step")
+        assert page.session.steps == 1
+    finally:
+        page.close()
