@@ -207,8 +207,21 @@ def test_random_frames_come_first_if_asked_for():
     assert second["action"].min() > 0.9
 
 
+def test_two_transforms_of_one_class_both_take_their_steps():
+    make, policy = parts("overactuated", "explore")
+
+    def twice() -> TransformedEnv:
+        return make().append_transform(DirectionPrimer(2, out_key="other"))
+
+    ours = batches(VectorCollector, twice, policy)
+    assert_same(ours, batches(Collector, twice, policy, **PLAIN))
+    assert all(batch["next", key].any() for batch in ours for key in ("direction", "other"))
+
+
 def test_an_environment_that_it_does_not_know_is_refused():
     make, policy = parts("overactuated", "policy")
+    with pytest.raises(ValueError, match="has 2 RewardSum and VectorCollector takes one"):
+        VectorCollector(lambda: make().append_transform(RewardSum()), policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="has a StepCounter; use"):
         VectorCollector(lambda: make().append_transform(StepCounter()), policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="num_envs=2 or more"):

@@ -106,6 +106,12 @@ def test_presets_of_papers_have_the_published_numbers(method):
     assert values == PUBLISHED[method]
 
 
+@pytest.mark.parametrize("method", [name for name in METHODS if name.endswith("_paper")])
+def test_presets_of_papers_learn_on_the_reward_itself(method):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert compose("config", overrides=[f"method={method}"]).learn.reward_scale == 1.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", RIVALS)
 def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(

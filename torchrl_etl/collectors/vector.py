@@ -85,11 +85,12 @@ class VectorCollector(Collector):
             "use_buffers": True,
         }
         super().__init__(create_env_fn, policy, **kwargs)
-        self._simulators, known = _take_apart(self.env)
+        self._simulators, transforms = _take_apart(self.env)
+        known = {type(part): part for part in transforms if type(part) in _KNOWN}
         self._reward_sum: RewardSum | None = known.get(RewardSum)
         self._init_tracker: InitTracker | None = known.get(InitTracker)
         self._synergy_action: SynergyAction | None = known.get(SynergyAction)
-        self._on_arrays = [part for kind, part in known.items() if kind not in _KNOWN]
+        self._on_arrays = [part for part in transforms if type(part) not in _KNOWN]
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
 
     @staticmethod
@@ -202,12 +203,18 @@ def _named(observations: Arrays | np.ndarray) -> Arrays:
     return observations if isinstance(observations, dict) else {"observation": observations}
 
 
-def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, dict[type[Transform], Transform]]:
-    """The simulators under an environment, and its transforms by type."""
+def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[Transform]]:
+    """The simulators under an environment, and its transforms, the innermost first."""
     transforms: list[Transform] = []
     while isinstance(env, TransformedEnv):
-        transforms += list(getattr(env.transform, "transforms", [env.transform]))
+        transforms = [*getattr(env.transform, "transforms", [env.transform]), *transforms]
         env = env.base_env
+    kinds = [type(transform) for transform in transforms]
+    if twice := next((kind for kind in _KNOWN if kinds.count(kind) > 1), None):
+        raise ValueError(
+            f"The environment has {kinds.count(twice)} {twice.__name__} and VectorCollector takes "
+            "one; use torchrl.collectors.Collector for it."
+        )
     foreign = [transform for transform in transforms if not VectorCollector.takes(transform)]
     if foreign or not isinstance(env, GymWrapper) or not isinstance(env._env, SyncVectorEnv):
         what = type(foreign[0]).__name__ if foreign else f"{type(env).__name__} of one simulator"
@@ -217,4 +224,4 @@ def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, dict[type[Transform], Tran
             f"array_reset, but the environment has a {what}; use "
             "torchrl.collectors.Collector for it."
         )
-    return env._env, {type(transform): transform for transform in transforms}
+    return env._env, transforms
