@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
@@ -23,6 +24,7 @@ class Objective(nn.Module):
 
     Args:
         sac (LeanSACLoss): the losses of actor, critics and temperature.
+        actor (TensorDictModuleBase): that actor, for terms that ask it for actions.
         terms (sequence of Term): what is minimized beside them.
 
     Keyword Args:
@@ -34,6 +36,7 @@ class Objective(nn.Module):
     def __init__(
         self,
         sac: LeanSACLoss,
+        actor: TensorDictModuleBase,
         terms: Sequence[Term] = (),
         *,
         normalizer: RunningNorm | None = None,
@@ -41,7 +44,7 @@ class Objective(nn.Module):
         reward: NestedKey = "reward",
     ) -> None:
         super().__init__()
-        self.sac, self.terms = sac, nn.ModuleList(terms)
+        self.sac, self.actor, self.terms = sac, actor, nn.ModuleList(terms)
         self.normalizer, self.return_scale, self.reward = normalizer, return_scale, reward
         sac.set_keys(reward=reward)
 

@@ -132,7 +132,7 @@ class SACLearner:
             support=support(bins, return_bound),
         )
         self.objective = Objective(
-            sac, terms, normalizer=normalizer, return_scale=scale, reward=reward
+            sac, actor, terms, normalizer=normalizer, return_scale=scale, reward=reward
         ).to(self.device)
         sac.make_value_estimator(gamma=gamma)
         _ = sac.target_entropy  # created lazily; it must exist before the optimizer does

@@ -30,8 +30,8 @@ def together(
 
     Keyword Args:
         joint (bool, optional): whether updates share a pass; else each learner makes its own.
-            Default: ``None``, all but compiled ones on a CPU, where the pass over several takes
-            longer than theirs one after another (``benchmarks/seeds.py``).
+            Default: ``None``, all but compiled ones: the pass over several does not compile
+            (torch 2.13, ``docs/torchrl_notes.md``).
 
     Returns:
         list: what each work returned, or the exception that ended it.
@@ -88,7 +88,7 @@ def _update(runs: Sequence[_Run], groups: dict[str, SideBySide], joint: bool | N
     """Update the learners of these runs, which are in the same stage."""
     learners = [run.due.learner for run in runs]
     if joint is None:
-        joint = not (learners[0].compile and learners[0].device.type == "cpu")
+        joint = not learners[0].compile
     if len(runs) == 1 or not joint:
         for run in runs:
             with run:
