@@ -19,13 +19,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig
 
 from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import (
+    OPENING_FAULTS,
     check_overrides,
     one_sentence,
     quiet_torchrl,
@@ -52,8 +52,7 @@ SYNERGIES = (
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    beforehand = (ValueError, OSError, ImportError, gymnasium.error.Error)
-    with one_sentence(*beforehand, SimulationError, CollectionError):
+    with one_sentence(*OPENING_FAULTS, CollectionError):
         experiments = list(asked_for(config, list(HydraConfig.get().overrides.task)))
     with StopOnSignal() as stop:
         ends = together([experiment.work(stop) for experiment in experiments])

@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
 import hydra
 from omegaconf import DictConfig
 
@@ -30,6 +29,7 @@ from torchrl_etl import zoo
 from torchrl_etl.analysis.moving_pictures import write_moving_pictures
 from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.command_line import (
+    OPENING_FAULTS,
     check_overrides,
     one_sentence,
     print_intervals,
@@ -53,7 +53,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error):
+    with one_sentence(*OPENING_FAULTS):
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)

@@ -13,19 +13,19 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import gymnasium
 import hydra
 from omegaconf import DictConfig
 
 from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.command_line import (
+    OPENING_FAULTS,
     check_overrides,
     one_sentence,
     print_intervals,
     quiet_torchrl,
     quote_paths,
 )
-from torchrl_etl.envs import SimulationError, resolve_task
+from torchrl_etl.envs import resolve_task
 from torchrl_etl.export import export_run
 from torchrl_etl.synergies.bundle import copy_bundle
 from torchrl_etl.training import resumed_config
@@ -37,7 +37,7 @@ CONF = Path(__file__).parent / "conf"
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     compose = partial(hydra.compose, "config")
-    with one_sentence(ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error):
+    with one_sentence(*OPENING_FAULTS):
         if config.run is None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         check_choice("part", config.part, ("all", "synergies"))

@@ -14,13 +14,17 @@ import signal
 import sys
 from pathlib import Path
 
-import gymnasium
 import hydra
 from omegaconf import DictConfig
 
 from torchrl_etl.analysis.viewer import Session, Subject
-from torchrl_etl.command_line import check_overrides, one_sentence, quiet_torchrl, quote_paths
-from torchrl_etl.envs import SimulationError
+from torchrl_etl.command_line import (
+    OPENING_FAULTS,
+    check_overrides,
+    one_sentence,
+    quiet_torchrl,
+    quote_paths,
+)
 from torchrl_etl.opened import open_bundle, open_run, open_zoo
 
 CONF = Path(__file__).parent / "conf"
@@ -30,7 +34,7 @@ SOURCES = ("run", "zoo", "bundle")
 @hydra.main(version_base="1.3", config_path="conf", config_name="view")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error):
+    with one_sentence(*OPENING_FAULTS):
         from torchrl_etl.analysis.viewer.page import Page, check_port  # needs an extra
 
         check_port(config.host, config.port)

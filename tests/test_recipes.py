@@ -91,12 +91,12 @@ def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, cap
     assert "95% interval" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_one_episode_is_told_without_an_interval(capsys):
     print_intervals({"return": {"mean": 2.0, "low": float("nan"), "high": float("nan")}})
     assert capsys.readouterr().out == "  return       2.000\n"
 
 
+@pytest.mark.slow
 def test_evaluate_draws_a_video_or_says_what_to_install(hand):
     done = process(
         "evaluate.py",

@@ -87,7 +87,7 @@ def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypat
 
 def test_seeds_whose_updates_are_compiled_take_turns(tmp_path, monkeypatch):
     def refuse(*arguments):
-        raise AssertionError("the pass over several does not compile")
+        raise AssertionError("the joint pass does not compile")
 
     monkeypatch.setattr(SideBySide, "__init__", refuse)
     monkeypatch.setattr("torchrl_etl.learners.sac.compiled", lambda function: function)

@@ -14,7 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+
 from torchrl_etl.checks import check_choice
+from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
 from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED
 from torchrl_etl.training.resumed import check_prefix, parse_override
@@ -23,6 +26,7 @@ with extra("recipes"):
     from omegaconf import DictConfig, OmegaConf
 
 __all__ = [
+    "OPENING_FAULTS",
     "check_overrides",
     "one_sentence",
     "print_intervals",
@@ -30,6 +34,9 @@ __all__ = [
     "quote_paths",
     "translate",
 ]
+
+OPENING_FAULTS = (ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error)
+"""What explains itself when a run, a bundle or an entry is opened with its simulators."""
 
 
 def check_overrides(config: Path, arguments: list[str], usage: str) -> None:

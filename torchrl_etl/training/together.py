@@ -15,23 +15,13 @@ from torchrl_etl.training.work import Due, Result, Work, alone
 __all__ = ["together"]
 
 
-def together(
-    works: Sequence[Work[Result]], *, joint: bool | None = None
-) -> list[Result | BaseException]:
-    """Do all works in turns, and updates that are due at the same time in one pass.
+def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
+    """Do all works in turns, and updates that are due at the same time as one unless compiled.
 
     Each work finds the random generators as it left them, and its updates get the random numbers
     that it would have drawn for them by itself: it ends with the numbers of
     :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
     the others to go on.
-
-    Args:
-        works (sequence of Work): runs of one make, each with its own seed.
-
-    Keyword Args:
-        joint (bool, optional): whether updates share a pass; else each learner makes its own.
-            Default: ``None``, all but compiled ones: the pass over several does not compile
-            (torch 2.13, ``docs/torchrl_notes.md``).
 
     Returns:
         list: what each work returned, or the exception that ended it.
@@ -48,7 +38,7 @@ def together(
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
             for alike in dict.fromkeys(run.alike for run in waiting):
-                _update([run for run in waiting if run.alike == alike], groups, joint)
+                _update([run for run in waiting if run.alike == alike], groups)
     finally:
         for run in runs:
             run.work.close()
@@ -84,17 +74,16 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, error
 
 
-def _update(runs: Sequence[_Run], groups: dict[str, SideBySide], joint: bool | None) -> None:
+def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
     """Update the learners of these runs, which are in the same stage."""
-    learners = [run.due.learner for run in runs]
-    if joint is None:
-        joint = not learners[0].compile
-    if len(runs) == 1 or not joint:
+    # The pass over several does not compile (torch 2.13): compiled, each by itself is faster.
+    if len(runs) == 1 or runs[0].due.learner.compile:
         for run in runs:
             with run:
                 scalars = run.due.learner.updates(run.due.batches)
             run.go_on(scalars)
         return
+    learners = [run.due.learner for run in runs]
     group = groups.get(stage := runs[0].due.stage)
     if group is None or group.learners != learners:
         group = groups[stage] = SideBySide(learners)
