@@ -6,7 +6,8 @@
 a bundle of them by itself, and says how much of their variance turns joints.
 
 ``--shuffle SEED`` lets the muscles change places, a control: the same activation at rest, as many
-synergies of the same strength, and no sense in them.
+synergies of the same strength, and no sense in them. ``--still`` is another: one synergy that moves
+no muscle, so that all there is of a body's synergies is the activation at rest.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--num-synergies", type=int, help="default: one for each joint")
     parser.add_argument("--rest", type=float, default=0.25, help="activation of coefficients 0")
-    parser.add_argument("--shuffle", type=int, metavar="SEED", help="let muscles change places")
+    control = parser.add_mutually_exclusive_group()
+    control.add_argument("--shuffle", type=int, metavar="SEED", help="let muscles change places")
+    control.add_argument("--still", action="store_true", help="one synergy that moves no muscle")
     arguments = parser.parse_args()
     quiet_torchrl()
     with one_sentence(ValueError, OSError):
@@ -55,14 +58,17 @@ def main() -> None:
             changes = muscle_changes(torques.matrix, arguments.num_synergies)
         if arguments.shuffle is not None:
             changes = np.random.default_rng(arguments.shuffle).permutation(changes, axis=1)
+        if arguments.still:
+            changes = np.zeros_like(changes[:1])
         with renaming(rest="--rest"):
             decoder = body_decoder(env, changes, rest=arguments.rest)
         known = {
-            "joint_share": joint_share(env, decoder, torques.matrix),
+            "joint_share": None if arguments.still else joint_share(env, decoder, torques.matrix),
             "control_authority": control_authority(decoder).mean().item(),
             "joints": torques.joints,
             "rest": arguments.rest,
             "shuffle": arguments.shuffle,
+            "still": arguments.still,
             "frames": 0,  # nothing is charged: this is a bound
             **facts(),
         }

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Is there anything that synergies could give on a task? Plain SAC, ETL, and ETL with two oracles;
-# one of these also with its muscles shuffled, a control.
+# one of these also with its muscles shuffled, and without any, two controls.
 #
 #     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
 #     JOBS=2 sh studies/kill_test.sh               both seeds at a time
@@ -31,9 +31,12 @@ queue() {
 queue sac
 queue etl
 queue etl_body
-[ -d "runs/oracles/body_shuffled-$task" ] ||
-  $python studies/body_synergies.py "$task" "runs/oracles/body_shuffled-$task" --shuffle 0
-queue etl_body_shuffled
+for control in "shuffled --shuffle 0" "still --still"; do
+  name=body_${control%% *}
+  [ -d "runs/oracles/$name-$task" ] ||
+    $python studies/body_synergies.py "$task" "runs/oracles/$name-$task" ${control#* }
+  queue etl_$name
+done
 learned=$out/$task-sac-seed0
 for model in gmvae pca; do
   oracle=runs/oracles/learned_$model-$task
