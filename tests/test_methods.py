@@ -17,6 +17,7 @@ from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.methods import METHODS as CLASSES
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import alone, resumed_config
@@ -164,6 +165,48 @@ def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method):
         torch.testing.assert_close(logged_too[key], value)
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "lattice learn.noise.kind=held",
+            "learn.noise.kind is 'held', but with method=lattice the actor has noise of its own; "
+            "use learn.noise.kind=independent.",
+        ),
+        ("dynsyn learn.noise.kind=held", "learn.noise.kind is 'held', but with method=dynsyn the"),
+        ("eme learn.n_steps=3", "learn.n_steps is 3, but with method=eme bonus and metric are of"),
+    ],
+)
+def test_a_setting_that_a_method_would_not_heed_is_refused(setting, message, tmp_path):
+    method, override = setting.split()
+    with pytest.raises(ValueError) as caught:
+        Experiment(tiny(f"method={method}", override, f"run_dir='{tmp_path}/run'"))
+    assert str(caught.value).startswith(message)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_of_before_that_holds_such_a_setting_goes_on_with_what_it_ran_with(tmp_path):
+    of_before = tiny("method=lattice", "learn.noise.kind=held")
+    assert Experiment(of_before, resume=tmp_path).config.learn.noise.kind == "independent"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_file_holds_the_settings_that_its_method_can_have(method):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        made = compose("config", overrides=[f"method={method}"])
+    for key, value, _ in CLASSES[made.method.learner].fixed:
+        assert OmegaConf.select(made, key) == value
+
+
+def test_a_method_without_synergies_says_that_nothing_is_explored_or_prefilled():
+    config = Experiment(tiny("method=sac", "learn.prefill=true", "run_dir=unused")).config
+    assert (config.exploration.kind, config.synergies.kind, config.learn.prefill) == (
+        None,
+        None,
+        False,
+    )
+
+
 def test_eme_measures_with_the_discount_of_its_learner(tmp_path):
     settings = ("method=eme", "learn.sac.gamma=0.83", f"run_dir='{tmp_path}/run'")
     objective = Experiment(tiny(*settings)).method.stage().learner.objective
@@ -229,8 +272,9 @@ def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
     settings = ("method.options.dep_frames=640", f"learn.learning_starts={starts}")
     workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
     run = rival("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
-    stage = Experiment(run).method.stage()
-    assert stage.learning_starts == expected
+    experiment = Experiment(run)
+    stage = experiment.method.stage()
+    assert stage.learning_starts == experiment.config.learn.learning_starts == expected
     assert controller(stage).dep_frames == 640 // 2 // 2  # actions of each worker
 
 

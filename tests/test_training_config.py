@@ -181,6 +181,19 @@ def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
     assert experiment.config.synergies.bundle == str(tmp_path / "bundle")
 
 
+def test_a_run_with_given_synergies_says_that_nothing_is_explored_fitted_or_prefilled(tmp_path):
+    names = [f"muscle_{i}" for i in range(16)]
+    save_bundle(SynergyDecoder(3, 16), tmp_path / "a", task="overactuated", actuators=names)
+    given = tiny(f"synergies='{tmp_path}/a'", "learn.prefill=true", f"run_dir='{tmp_path}/run'")
+    experiment = Experiment(given)
+    experiment.folder.open(resume=False)
+    saved = resumed_config(tmp_path / "run", defaults=tiny())
+    assert (saved.stage, saved.learn.prefill) == ("learn", False)
+    assert saved.exploration == {"kind": None}
+    assert saved.synergies == {"kind": None, "bundle": str(tmp_path / "a")}
+    assert Experiment(saved, resume=tmp_path / "run").config == experiment.config
+
+
 def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
     folders = [RunFolder(tmp_path / "run", tiny(), unique=True) for _ in range(3)]
     for folder in folders:

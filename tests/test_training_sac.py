@@ -229,14 +229,6 @@ def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many
     stage.close()
 
 
-def test_the_bonus_of_eme_stays_one_of_single_steps():
-    stage = method_stage("eme", "learn.n_steps=3")
-    fill(stage)
-    assert stage.multi_step is None
-    assert stage.update()["loss_qvalue"].isfinite()
-    stage.close()
-
-
 def test_learning_rates_fall_in_a_line_with_the_frames():
     stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
     initial = [group["lr"] for group in stage.learner.optimizer.param_groups]

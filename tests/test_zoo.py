@@ -230,6 +230,14 @@ def test_given_synergies_are_those_of_the_entry(exported):
     assert str(exported) not in command_of(made, composed, "toy")
 
 
+@pytest.mark.parametrize("choice", ["synergies=zoo:{}", "method=sac", "method=lattice"])
+def test_the_command_of_a_run_that_explored_nothing_makes_the_same_configuration(choice, exported):
+    made = Experiment(tiny("run_dir=unused", choice.format(exported))).config
+    told = shlex.split(command_of(made, composed, exported))
+    again = Experiment(composed(translate([*told[2:], "run_dir=unused"], CONF))).config
+    assert place_aside(again) == place_aside(made)
+
+
 def rewrite(entry, **changes):
     card = json.loads((entry / "card.json").read_text())
     (entry / "card.json").write_text(json.dumps({**card, **changes}))

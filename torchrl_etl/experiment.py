@@ -16,6 +16,7 @@ from torchrl.checkpoint import Checkpoint
 from torchrl_etl.checks import check_choice
 from torchrl_etl.collectors import start_resource_tracker
 from torchrl_etl.envs import resolve_task
+from torchrl_etl.extras import extra
 from torchrl_etl.methods import METHODS
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
@@ -56,6 +57,8 @@ class Experiment:
         unique: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
+        with extra("recipes"):
+            from omegaconf import OmegaConf
         start_resource_tracker()
         validate(config)
         check_choice("method.learner", config.method.learner, list(METHODS))
@@ -64,7 +67,11 @@ class Experiment:
         path = Path(resume or config.run_dir).expanduser()
         self.folder = RunFolder(path, self.config, unique=unique)
         self.context = Context(self.config, self.folder, say)
-        self.method = METHODS[config.method.learner](self.context)
+        method = METHODS[config.method.learner]
+        if resume is not None:  # a run of before may say what its method did not heed
+            for key, value, _ in method.fixed:
+                OmegaConf.update(self.config, key, value)
+        self.method = method(self.context)
         if config.frames is not None:
             self._divide_frames()
         self.method.check()

@@ -60,8 +60,7 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
         ValueError: if there is no run, it is of a release with other names, or its policy is not
             one that an entry can hold.
     """
-    config = resumed_config(run, defaults=compose([]))
-    experiment = Experiment(config, resume=run)
+    experiment = Experiment(resumed_config(run, defaults=compose([])), resume=run)
     stage = experiment.learned()
     learner, context = stage.learner, experiment.context
     described = describe_policy(experiment, learner)
@@ -73,12 +72,12 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
         actuators=list(context.spec.actuators),
         policy=described,
         training={
-            "method": config.method.name,
+            "method": experiment.config.method.name,
             "frames": experiment.method.frames_before() + stage.frames,
-            "seed": config.seed,
+            "seed": experiment.config.seed,
             "commit": starts[-1].pop("commit", None),
             "versions": starts[-1],
-            "command": command_of(config, compose, target.name),
+            "command": command_of(experiment.config, compose, target.name),
         },
         evaluation=result.summary(),
     )
@@ -130,9 +129,12 @@ def command_of(config: DictConfig, compose: Compose, name: str) -> str:
         name (str): of the entry, whose synergies stand for those that the run was given.
     """
     chosen: list[str] = []
+    unread = set()
     for group, key in _GROUPS.items():
         kind = OmegaConf.select(config, key)
-        if OmegaConf.select(compose(chosen), key) == kind:
+        if kind is None:  # nothing was explored, or fitted
+            unread.add(group)
+        if kind is None or OmegaConf.select(compose(chosen), key) == kind:
             continue
         with suppress(HydraException):  # of one's own, in a file that is not here
             compose([*chosen, f"{group}={kind}"])
@@ -143,7 +145,7 @@ def command_of(config: DictConfig, compose: Compose, name: str) -> str:
         words.append(f"synergies=zoo:{name}")
     shared = "learn.frames" if config.frames is not None else None  # follows from frames
     for key, value in _differences(base, mine):
-        if key not in ("env", shared):
+        if key not in ("env", shared) and key.partition(".")[0] not in unread:
             words.append(f"{key}={value}")
     return shlex.join(["python", "recipes/etl_sac.py", *words])
 

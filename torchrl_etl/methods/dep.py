@@ -41,11 +41,10 @@ class DEP(Method):
             wrap=lambda behavior: TensorDictSequential(behavior, controller),
             more=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
         )
-        return self.context.stage(
-            learner,
-            env_options={"muscle_lengths": True},
-            learning_starts=max(alone, self.context.config.learn.learning_starts),
-        )
+        stage = self.context.stage(learner, env_options={"muscle_lengths": True})
+        stage.learning_starts = max(alone, stage.learning_starts)
+        self.context.config.learn.learning_starts = stage.learning_starts
+        return stage
 
     def check(self) -> None:
         super().check()

@@ -30,7 +30,7 @@ __all__ = ["DynSyn"]
 class DynSyn(Method):
     """SAC with one action a group; muscles are grouped while joints are thrown about.
 
-    Its actor's distribution is its own: ``learn.noise`` is not read.
+    Its actor's distribution is its own, with the noise in it.
 
     Options: ``frames`` of the recording, which are charged, ``amplitude`` of joint velocities in
     it and ``group_share``, groups per muscle (one number, or one for ``legs`` and one for
@@ -39,6 +39,7 @@ class DynSyn(Method):
     stage's frames on, linearly up to their ceiling at the last frame.
     """
 
+    fixed = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
     takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
 
     def __init__(self, context: Context) -> None:

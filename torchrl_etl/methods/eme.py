@@ -15,9 +15,8 @@ __all__ = ["EME"]
 class EME(Method):
     """SAC on reward plus bonus, the metric trained beside it.
 
-    Bonus and metric are of single steps: ``learn.n_steps`` is not read.
-
-    Its metric has the discount of the learner.
+    Bonus and metric are of single steps, so the critics' targets are too. The metric has the
+    discount of the learner.
 
     Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
 
@@ -26,6 +25,7 @@ class EME(Method):
     :class:`~torchrl_etl.baselines.EMEBonus`.
     """
 
+    fixed = (("learn.n_steps", 1, "bonus and metric are of single steps"),)
     takes = ("embedding_dim", "hidden", "ensemble", "lr", "tau", "weight", "normalize", "max_scale")
 
     def stage(self) -> Stage:
@@ -45,4 +45,4 @@ class EME(Method):
                 term = Term(loss, lr=options["lr"], tau=options["tau"])
             return {"terms": [term], "reward": "total_reward"}
 
-        return self.context.stage(self.context.learner(more=more), transforms=[bonus], n_steps=1)
+        return self.context.stage(self.context.learner(more=more), transforms=[bonus])

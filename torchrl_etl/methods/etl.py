@@ -80,7 +80,6 @@ class ETL(Method):
         config = context.config
         self.given = config.synergies.bundle is not None
         self.charged = 0 if self.given else config.explore.frames
-        self.prefills = config.learn.prefill and not self.given
         if config.stage == "learn" and not self.given:
             raise ValueError(
                 "stage=learn needs synergies=PATH, the run folder or bundle of an earlier "
@@ -97,20 +96,23 @@ class ETL(Method):
         if self.given:
             self._settle_given()
         self._settle_num_synergies()
+        self.prefills = config.learn.prefill
 
     def _settle_given(self) -> None:
         """Look at the synergies that were given; those of the body are made, once in a run."""
-        config, space = self.context.config, self.context.spec
-        if config.synergies.bundle == BODY:
-            if not surviving_folder(self.context.folder.synergies).exists():
-                env = self.context.make_env(seed=0)
-                env.reset()
-                self.of_body = body_synergies(env, config.num_synergies)
-                config.num_synergies = self.of_body.num_synergies
-                env.close()
-                return
-        else:  # the absolute path stands in the run's configuration
-            config.synergies.bundle = str(bundle_path(config.synergies.bundle))
+        config, space, given = self.context.config, self.context.spec, self.context.config.synergies
+        if given.bundle != BODY:  # the absolute path stands in the run's configuration
+            given.bundle = str(bundle_path(given.bundle))
+        self.explores_nothing()
+        config.synergies, config.stage = {"kind": None, "bundle": given.bundle}, "learn"
+        own = self.context.folder.synergies
+        if given.bundle == BODY and not surviving_folder(own).exists():
+            env = self.context.make_env(seed=0)
+            env.reset()
+            self.of_body = body_synergies(env, config.num_synergies)
+            config.num_synergies = self.of_body.num_synergies
+            env.close()
+            return
         _, info = load_bundle(self.bundle)
         config.num_synergies = info.num_synergies
         check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())

@@ -17,12 +17,13 @@ __all__ = ["Lattice"]
 
 
 class Lattice(Method):
-    """SAC with Lattice's actor, whose noise is its own: ``learn.noise`` is not read.
+    """SAC with Lattice's actor, whose noise is its own.
 
     Options: ``freq``, steps between draws of the noise matrices where they depend on the state,
     and keyword arguments of :func:`~torchrl_etl.baselines.make_lattice_actor`.
     """
 
+    fixed = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
     takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
 
     def __init__(self, context: Context) -> None:

@@ -29,14 +29,17 @@ class Method(ABC):
         charged (int): frames that :meth:`prepare` takes; they count.
         has_synergies (bool): whether ``stage`` and ``synergies`` may be given.
         takes (tuple of str): names of its own options.
+        fixed (tuple): settings that it can have in one way alone, each with that value and why.
 
     Raises:
-        ValueError: for options that it does not have, or that cannot be used.
+        ValueError: for options that it does not have, or that cannot be used, and for settings
+            that it would not heed.
     """
 
     charged: int = 0
     has_synergies: ClassVar[bool] = False
     takes: ClassVar[tuple[str, ...]] = ()
+    fixed: ClassVar[tuple[tuple[str, Any, str], ...]] = ()
     options: Mapping[str, Any]
 
     def __init__(self, context: Context) -> None:
@@ -55,6 +58,21 @@ class Method(ABC):
                 f"method={config.method.name} has one stage and no synergies; leave stage and "
                 "synergies out."
             )
+        for key, value, reason in self.fixed:
+            section, _, name = key.rpartition(".")
+            if (given := context.options(section)[name]) != value:
+                raise ValueError(
+                    f"{key} is {given!r}, but with method={config.method.name} {reason}; "
+                    f"use {key}={value}."
+                )
+        if not self.has_synergies:
+            self.explores_nothing()
+            config.synergies = {"kind": None, "bundle": None}
+
+    def explores_nothing(self) -> None:
+        """Say so in the run's configuration: there is no stage 1 whose settings would hold."""
+        self.context.config.exploration = {"kind": None}
+        self.context.config.learn.prefill = False
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         """Find out what :meth:`stage` needs and leave it in the run folder.
