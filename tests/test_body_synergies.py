@@ -25,6 +25,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import load_bundle, save_bundle
 from torchrl_etl.training import resumed_config
+from torchrl_etl.training.context import Context
 
 TASK = "myoHandKeyTurn"
 
@@ -123,7 +124,16 @@ def test_a_run_takes_the_synergies_of_its_body_and_goes_on_with_them(tmp_path):
 @pytest.mark.parametrize(
     ("env", "words"), [("overactuated", "MuJoCo"), ("humanoid-stand", "moved by muscles alone")]
 )
-def test_a_body_without_muscles_has_no_synergies_of_its_own(env, words, tmp_path):
+def test_a_body_without_muscles_has_no_synergies_of_its_own(env, words, tmp_path, monkeypatch):
+    made, make_env = [], Context.make_env
+
+    def remembered(self, **options):
+        made.append((make_env(self, **options), options))
+        return made[-1][0]
+
+    monkeypatch.setattr(Context, "make_env", remembered)
     with pytest.raises(ValueError, match=words):
         Experiment(tiny(f"env={env}", "synergies.bundle=body", f"run_dir={tmp_path / 'run'}"))
     assert not (tmp_path / "run").exists()
+    (looked_at,) = (env for env, options in made if "seed" in options)
+    assert looked_at.is_closed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -107,11 +108,10 @@ class ETL(Method):
         config.synergies, config.stage = {"kind": None, "bundle": given.bundle}, "learn"
         own = self.context.folder.synergies
         if given.bundle == BODY and not surviving_folder(own).exists():
-            env = self.context.make_env(seed=0)
-            env.reset()
-            self.of_body = body_synergies(env, config.num_synergies)
+            with closing(self.context.make_env(seed=0)) as env:
+                env.reset()
+                self.of_body = body_synergies(env, config.num_synergies)
             config.num_synergies = self.of_body.num_synergies
-            env.close()
             return
         _, info = load_bundle(self.bundle)
         config.num_synergies = info.num_synergies
