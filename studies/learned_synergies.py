@@ -43,7 +43,7 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
 
     config = resumed_config(arguments.run, ["evaluation.episodes=1"])
-    if config.method.learner != "sac":
+    if config.method.kind != "sac":
         parser.error(f"{arguments.run} is a run of {config.method.name}; pass one of method=sac.")
     experiment = Experiment(config, resume=arguments.run)
     stage = experiment.learned()

@@ -8,22 +8,24 @@ import sys
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import LossModule
 
 from tests.configs import CONF, ROOT, tiny
-from tests.stages import changed, goes_on_after_a_load, snapshot
+from tests.stages import changed, fill, goes_on_after_a_load, snapshot
 from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
+from torchrl_etl.training import resumed_config
 
 PAGE = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```$", PAGE, re.S | re.M))
-MODULES = ("curiosity", "at_random", "recordings")
+MODULES = ("curiosity", "at_random", "recordings", "thrift")
 BRIEF = ("explore.frames=192", "learn.frames=64", "evaluation.episodes=1")
 OWN = ("exploration=curiosity", "synergies=random")
 
@@ -92,6 +94,7 @@ def test_the_page_has_one_short_python_file_and_one_yaml_file_for_each():
     assert set(FILES) - set(python) == {
         "recipes/conf/exploration/curiosity.yaml",
         "recipes/conf/synergies/random.yaml",
+        "recipes/conf/method/thrift.yaml",
     }
     for name, code in python.items():
         assert sum(bool(line.strip()) for line in code.splitlines()) < 40, name
@@ -155,10 +158,55 @@ def test_the_toy_synergies_fit_recordings_worse_than_nmf(conf, tmp_path, capsys)
     assert nmf > 0.99 > at_random > 0
 
 
+def test_the_toy_method_runs_and_goes_on_after_a_kill_with_the_same_numbers(conf, tmp_path):
+    def make():
+        return Experiment(tiny("run_dir=unused", "method=thrift", conf=conf)).method.stage()
+
+    assert goes_on_after_a_load(make, tmp_path)
+    settings = ("method=thrift", "learn.frames=96", "evaluation.episodes=1")
+    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings, conf=conf)).run()
+    assert summary["learn"]["frames_charged"] == 96
+    assert resumed_config(tmp_path / "run").method.kind == "thrift:Thrift"
+
+
+def test_the_toy_method_learns_on_the_reward_less_the_effort(conf):
+    asked = ("method=thrift", "method.options.price=2")
+    stage = Experiment(tiny("run_dir=unused", *asked, conf=conf)).method.stage()
+    stage.restart_collection()
+    fill(stage)
+    batch = stage.sample()
+    stage.close()
+    effort = ((batch["action"] + 1) / 2).square().mean(-1, keepdim=True)
+    cost = batch["next", "reward"] - batch["next", "thrifty_reward"]
+    torch.testing.assert_close(cost, 2 * effort)
+    assert "thrifty_reward" in stage.learner.update(batch)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("options.price", -1, r"method\.options\.price is -1"),
+        ("options.cost", 1, r"method\.options\.cost is none of the options .*\(price\)"),
+        ("kind", "thrift:Theft", r"method\.kind is .*in thrift there is no class Theft that is"),
+        ("kind", "thrift:EffortCost", "no class EffortCost that is derived from Method"),
+        ("kind", "thrift", r"method\.kind is 'thrift'; choose one of etl, sac, lattice"),
+        ("kind", None, r"method\.kind is None; choose one of etl, sac, lattice"),
+    ],
+)
+def test_a_method_that_cannot_be_had_is_one_sentence(key, value, words, conf):
+    config = tiny("run_dir=unused", "method=thrift", conf=conf)
+    OmegaConf.update(config, f"method.{key}", value, force_add=True)
+    with pytest.raises(ValueError, match=words):
+        Experiment(config)
+
+
 def test_the_command_line_knows_kinds_that_have_a_file(conf):
-    check_overrides(conf / "config.yaml", [*OWN, "exploration.lr=0.1", "synergies.seed=3"], "")
+    settings = ("exploration.lr=0.1", "synergies.seed=3", "method=thrift", "method.options.price=1")
+    check_overrides(conf / "config.yaml", [*OWN, *settings], "")
     assert translate(["synergies=random"], conf) == ["synergies=random"]
     assert translate(["exploration.kind=a:B"], conf) == ["exploration.kind=a:B"]
+    kinds = ["method.kind=a:B", "method.kind=sar"]
+    assert translate(kinds, conf) == ["method.kind=a:B", "method=sar"]
 
 
 @pytest.mark.parametrize(

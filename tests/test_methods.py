@@ -194,7 +194,7 @@ def test_a_run_of_before_that_holds_such_a_setting_goes_on_with_what_it_ran_with
 def test_a_file_holds_the_settings_that_its_method_can_have(method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         made = compose("config", overrides=[f"method={method}"])
-    for key, value, _ in CLASSES[made.method.learner].fixed:
+    for key, value, _ in CLASSES[made.method.kind].fixed:
         assert OmegaConf.select(made, key) == value
 
 

@@ -290,6 +290,7 @@ def test_no_preset_chooses_bfloat16(preset):
         ("learn.anchor=0.1", "learn.anchor is called learn.decoder.distillation_weight now."),
         ("+learn.anchor=0.1", "learn.anchor is called learn.decoder.distillation_weight now."),
         ("explore.gmvae.hidden=[8]", "explore.gmvae.hidden is called synergies.hidden now."),
+        ("method.learner=sac", "method.learner is called method.kind now."),
         ("learn.sac.n_steps=3", "learn.sac.n_steps is called learn.n_steps now."),
     ],
 )

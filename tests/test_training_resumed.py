@@ -63,6 +63,16 @@ def test_one_of_a_release_with_other_names_says_so(file):
         resumed_config(file.parent, defaults=tiny())
 
 
+def test_a_method_by_its_former_key_goes_on(file):
+    changed(file, method__learner="sac")
+    config = OmegaConf.load(file)
+    del config.method["kind"]
+    file.write_text(OmegaConf.to_yaml(config))
+    resumed = resumed_config(file.parent, defaults=tiny())
+    assert resumed.method == {"name": "etl", "kind": "sac"}
+    validate(resumed)
+
+
 def test_settings_newer_than_the_run_take_their_defaults_with_a_warning(file):
     config = OmegaConf.load(file)
     del config.learn["prefill"], config["vaf_curve"]

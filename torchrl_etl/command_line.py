@@ -92,9 +92,10 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
     """Short and former ways to write a setting, as Hydra reads them.
 
     ``synergies=PATH`` is ``synergies.bundle=PATH`` unless it names a kind, ``KIND`` of
-    ``synergies.kind=KIND`` and ``exploration.kind=KIND`` brings that kind's other settings unless
-    it is a class of one's own, ``module:Class``, and the presets that hold today's defaults are no
-    preset: they are left out, as ``null`` is, which Hydra does not take for a group.
+    ``synergies.kind=KIND``, ``exploration.kind=KIND`` and ``method.kind=KIND`` brings that kind's
+    other settings unless it is a class of one's own, ``module:Class``, and the presets that hold
+    today's defaults are no preset: they are left out, as ``null`` is, which Hydra does not take for
+    a group.
 
     Args:
         arguments (sequence of str): the command line without the program.
@@ -119,7 +120,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         if (old := _former(name)) is not None:
             raise ValueError(f"{name} is called {RENAMED[old]}{name.removeprefix(old)} now.")
         kinds = {path.stem for path in (groups / "synergies").glob("*.yaml")}
-        if name in ("synergies.kind", "exploration.kind") and ":" not in value:
+        if name in ("synergies.kind", "exploration.kind", "method.kind") and ":" not in value:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:
             key = "synergies.bundle"

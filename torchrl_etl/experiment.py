@@ -13,11 +13,12 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import naming
 from torchrl_etl.collectors import start_resource_tracker
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.extras import extra
-from torchrl_etl.methods import METHODS
+from torchrl_etl.methods import METHODS, Method
+from torchrl_etl.own_code import find_class
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.context import Context
@@ -61,13 +62,13 @@ class Experiment:
             from omegaconf import OmegaConf
         start_resource_tracker()
         validate(config)
-        check_choice("method.learner", config.method.learner, list(METHODS))
+        with naming("method"):
+            method = find_class(config.method.get("kind"), METHODS, Method)
         self.config = config.copy()
         self.task = resolve_task(config.env, config.goal)
         path = Path(resume or config.run_dir).expanduser()
         self.folder = RunFolder(path, self.config, unique=unique)
         self.context = Context(self.config, self.folder, say)
-        method = METHODS[config.method.learner]
         if resume is not None:  # a run of before may say what its method did not heed
             for key, value, _ in method.fixed:
                 OmegaConf.update(self.config, key, value)

@@ -22,3 +22,4 @@ METHODS: Mapping[str, type[Method]] = {
     "eme": EME,
     "sar": SAR,
 }
+"""Methods by name; ``"my_module:MyMethod"`` names one's own."""

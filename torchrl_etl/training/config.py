@@ -49,6 +49,7 @@ RENAMED = {
     "explore.fit.lr": "synergies.lr",
     "explore.fit.kl_weight": "synergies.kl_weight",
     "explore.fit.component_kl_weight": "synergies.component_kl_weight",
+    "method.learner": "method.kind",
     "learn.updates_per_frame": "learn.replay_ratio",
     "learn.fine_tuning": "learn.decoder.fine_tuning",
     "learn.decoder_lr": "learn.decoder.lr",

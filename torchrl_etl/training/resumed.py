@@ -104,6 +104,8 @@ def _stored(path: Path) -> DictConfig:
     except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
         config, fault = None, " ".join(str(error).split())
     fault = fault or _lacks(config)
+    if fault is None and "learner" in config.method:  # nothing but its name has changed
+        config.method.kind = config.method.pop("learner")
     if fault is None and (old := [k for k in RENAMED if OmegaConf.select(config, k) is not None]):
         raise ValueError(
             f"{path} is of a release whose settings had other names ({old[0]}, now "
