@@ -37,7 +37,6 @@ from torchrl_etl.synergies import (
     SynergyModel,
     fit_synergies,
     read_recording,
-    save_bundle,
 )
 
 CONF = Path(__file__).parent / "conf"
@@ -160,13 +159,11 @@ def leave(
     rows.writerows((number, *found[number]) for number in found)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "vaf.csv", text.getvalue())
-    decoder = model.decoder(recording.activity)
-    save_bundle(
-        decoder,
+    model.save(
         folder / "synergies",
+        recording.activity,
         task=Path(config.data).stem,
         actuators=recording.muscles,
-        kind=kind,
         facts={
             "vaf": found[model.num_synergies].fitted,
             "vaf_held_out": found[model.num_synergies].held_out,
@@ -175,6 +172,7 @@ def leave(
         },
     )
     pictures = folder / "pictures"
+    decoder = model.decoder(recording.activity)
     synergy_heatmap(decoder, recording.muscles, pictures / "synergies.png")
     series = {
         f"{kind.upper()}, fitted": [of.fitted for of in found.values()],

@@ -20,7 +20,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.synergies import fit_synergies, save_bundle
+from torchrl_etl.synergies import fit_synergies
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.run_folder import facts
 
@@ -71,14 +71,8 @@ def main() -> None:
         "frames": 0,  # nothing is charged: this is a bound
         **facts(),
     }
-    save_bundle(
-        model.decoder(shown),
-        arguments.out,
-        task=experiment.task.env_id,
-        actuators=experiment.context.spec.actuators,
-        kind=model.kind,
-        facts=known,
-    )
+    names = experiment.context.spec.actuators
+    model.save(arguments.out, shown, task=experiment.task.env_id, actuators=names, facts=known)
     print(json.dumps(known))
 
 

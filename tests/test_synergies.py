@@ -17,7 +17,6 @@ from torchrl_etl.synergies import (
     SynergyModel,
     fit_synergies,
     load_bundle,
-    save_bundle,
 )
 
 AFFINE = ("pca", "nmf", "sar")
@@ -259,10 +258,11 @@ def test_what_is_fitted_once_adds_no_loss_to_stage_1(kind: str) -> None:
 @pytest.mark.parametrize("kind", SYNERGY_MODELS)
 def test_a_bundle_of_every_kind_encodes_and_decodes_as_what_was_saved(kind: str, tmp_path) -> None:
     actions = activity()
-    decoder = fitted(kind, actions).decoder(actions, residual=0.5)
-    save_bundle(decoder, tmp_path / "b", task="toy", actuators=list("abcdef"), kind=kind)
-    copy, info = load_bundle(tmp_path / "b")
-    assert info.kind == kind and info.format_version == 2
+    model = fitted(kind, actions)
+    decoder, facts = model.decoder(actions, residual=0.5), {"rows": len(actions)}
+    model.save(tmp_path / "b", actions, task="toy", actuators=list("abcdef"), facts=facts)
+    copy, info = load_bundle(tmp_path / "b", residual=0.5)
+    assert info.kind == kind and info.facts == facts and info.format_version == 2
     components = None if info.encoder is None else info.encoder["num_components"]
     assert components == {"gmvae": 2, "vae": 1}.get(kind)
     synergy = 2 * torch.rand(20, 8) - 1

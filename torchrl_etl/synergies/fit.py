@@ -50,8 +50,7 @@ def fit_synergies(
         **options: of the class of that kind.
 
     Returns:
-        SynergyModel: the fitted model; its ``decoder(actions)`` is ready for
-        :func:`~torchrl_etl.synergies.save_bundle`.
+        SynergyModel: the fitted model; ``model.save(path, actions, ...)`` leaves a bundle of it.
 
     Raises:
         TypeError, ValueError: before anything is fitted, if the kind is unknown, or actions or

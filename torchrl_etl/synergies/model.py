@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
 
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.synergies.bundle import save_bundle
 
 __all__ = ["SynergyModel"]
 
@@ -49,3 +52,22 @@ class SynergyModel(ABC):
     @abstractmethod
     def reconstruct(self, actions: Tensor) -> Tensor:
         """Actions [*, n] rebuilt from their d coefficients."""
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        actions: Tensor,
+        *,
+        task: str,
+        actuators: Sequence[str],
+        facts: Mapping[str, Any] | None = None,
+    ) -> Path:
+        """Leave a bundle of the decoder that spans ``actions`` [N, n], with this model's kind.
+
+        Args:
+            path, task, actuators, facts: see :func:`~torchrl_etl.synergies.save_bundle`.
+        """
+        decoder = self.decoder(actions)
+        return save_bundle(
+            decoder, path, task=task, actuators=actuators, facts=facts, kind=self.kind
+        )
