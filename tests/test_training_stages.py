@@ -43,6 +43,23 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
 
 
+@pytest.mark.parametrize("ratio", [-1.0, math.nan, 1e9])
+def test_a_stage_refuses_a_replay_ratio_that_cannot_be(ratio, tmp_path):
+    context = Experiment(tiny("method=sac", f"run_dir='{tmp_path}/run'")).context
+    with pytest.raises(ValueError, match=r"learn\.replay_ratio is .*; it must be a number in"):
+        context.stage(context.learner(), replay_ratio=ratio)
+
+
+def test_a_learning_rate_of_null_is_the_learner_s():
+    for stage in (
+        explorer("exploration.lr=null", "synergies.lr=0.25", "explore.sac.lr=0.5").stage,
+        learn_stage(None, "learn.decoder.lr=null", "learn.sac.lr=0.5"),
+    ):
+        rates = {group["lr"] for group in stage.learner.optimizer.param_groups}
+        assert rates - {0.25} == {0.5}
+        stage.close()
+
+
 def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
     found = explorer("action_repeat=2")
     found.stage.collect()

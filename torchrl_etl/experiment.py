@@ -73,9 +73,9 @@ class Experiment:
             for key, value, _ in method.fixed:
                 OmegaConf.update(self.config, key, value)
         self.method = method(self.context)
+        self.method.check()
         if config.frames is not None:
             self._divide_frames()
-        self.method.check()
         if warning := bfloat16_warning(self.config):
             say(f"Warning: {warning}")
         self.resume = resume is not None

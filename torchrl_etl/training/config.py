@@ -145,10 +145,9 @@ def _check_values(config: DictConfig) -> None:
     check_integer(0, **of("seed", "restart_seed", "evaluation.every", "explore.fit.final_updates"))
     if config.seed >= 2**31:
         raise ValueError(f"seed is {config.seed}; it must be below 2147483648.")
-    check_integer(1, **of("action_repeat", "log_every", "evaluation.episodes", "checkpoint.every"))
+    check_integer(1, **of("log_every", "evaluation.episodes", "checkpoint.every"))
+    check_integer(1, **of("vaf_curve.updates"))
     check_integer(2, **of("checkpoint.keep"))
-    check_integer(1, **of("explore.frames", "learn.frames", "vaf_curve.updates"))
-    check_real("(0, inf)", **of("explore.replay_ratio", "learn.replay_ratio"))
     check_sizes(**of("vaf_curve.dims"))
     workers = of("collector.num_envs", "collector.num_workers", "collector.frames_per_batch")
     check_integer(1, **workers)

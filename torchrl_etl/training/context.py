@@ -21,7 +21,7 @@ from torchrl_etl.learners import SACLearner, build_learner
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
-from torchrl_etl.training.stage import Stage, frames_per_action
+from torchrl_etl.training.stage import Stage, check_budget, frames_per_action
 from torchrl_etl.training.work import Work
 
 if TYPE_CHECKING:
@@ -98,6 +98,8 @@ class Context:
         configured = {key: options[key] for key in ("actor", "critic", "sac", "noise")}
         compile = self.config.compile
         if compile is None:  # what it takes to begin must pay
+            with naming(section):
+                check_budget(options["frames"], options["replay_ratio"])
             compile = options["frames"] * options["replay_ratio"] >= 10_000
         configured["sac"]["compile"] = compile
         random = options.get("init_random_frames", 0)

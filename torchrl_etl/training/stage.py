@@ -77,7 +77,7 @@ class Stage:
         buffer_size (int): transitions to keep, 2 or more; never more than the budget are allocated.
         buffer_storage (str): "memory" keeps them on the device, "memmap" in files.
         batch_size (int): transitions in an update, 2 or more.
-        replay_ratio (float): updates per frame.
+        replay_ratio (float): updates per frame, up to 1,000.
         learning_starts (int): frames before the first update.
         reward_scale (float): factor on the task's reward, before anything else reads it.
         n_steps (int): rewards in a critic's target before it bootstraps, fewer at the end of an
@@ -120,7 +120,8 @@ class Stage:
         action_repeat: int = 1,
         restart_seed: int = 0,
     ) -> None:
-        check_integer(1, frames=frames, n_steps=n_steps)
+        check_budget(frames, replay_ratio)
+        check_integer(1, n_steps=n_steps)
         check_integer(2, batch_size=batch_size, buffer_size=buffer_size)
         check_integer(0, learning_starts=learning_starts)
         check_real("(0, inf)", reward_scale=reward_scale)
@@ -284,6 +285,19 @@ class Stage:
             # garbage collector to come by.
             self.batches = None
             gc.collect()
+
+
+def check_budget(frames: int, replay_ratio: float) -> None:
+    """Refuse numbers of frames, and of updates per frame, that no stage can have.
+
+    Examples:
+        >>> check_budget(1000, 1e9)
+        Traceback (most recent call last):
+        ...
+        ValueError: replay_ratio is 1000000000.0; it must be a number in (0, 1000].
+    """
+    check_integer(1, frames=frames)
+    check_real("(0, 1000]", replay_ratio=replay_ratio)
 
 
 def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
