@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from torchrl_etl.checks import check_choice, check_integer
+from torchrl_etl.checks import check_choice, check_integer, check_real
 
 __all__ = ["DEPController", "DEPExploration"]
 
@@ -256,11 +256,8 @@ class DEPExploration(TensorDictModuleBase):
                 "the unbatched one, such as env.full_action_spec_unbatched['action']."
             )
         check_integer(1, intervention_length=intervention_length, policy_every=policy_every)
-        if dep_frames < 0 or not 0 <= probability <= 1:
-            raise ValueError(
-                f"dep_frames is {dep_frames} and probability {probability}; they must be at least "
-                "0, and the probability at most 1."
-            )
+        check_integer(0, dep_frames=dep_frames)
+        check_real("[0, 1]", probability=probability)
         super().__init__()
         self.dep_frames, self.probability = dep_frames, probability
         self.intervention_length, self.policy_every = intervention_length, policy_every

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from torchrl_etl.checks import check_real, naming
+from torchrl_etl.checks import naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.directions import DirectionExploration
 from torchrl_etl.learners.term import Term
@@ -23,16 +23,20 @@ class METRAExploration(DirectionExploration):
         spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Keyword Args:
-        lr (float): learning rate of φ and of the multiplier.
+        lr (float, optional): learning rate of φ and of the multiplier; ``None``: the learner's.
         metra (mapping): keyword arguments of the loss.
         **directions: see :class:`~torchrl_etl.exploration.DirectionExploration`.
     """
 
     def __init__(
-        self, spec: EnvironmentSpec, *, lr: float, metra: Mapping[str, Any], **directions: Any
+        self,
+        spec: EnvironmentSpec,
+        *,
+        lr: float | None,
+        metra: Mapping[str, Any],
+        **directions: Any,
     ) -> None:
         super().__init__(spec, **directions)
-        check_real("(0, inf)", lr=lr)
         self._lr, self._metra = lr, dict(metra)
 
     def terms(self) -> Sequence[Term]:

@@ -24,7 +24,7 @@ class MetricExploration(DirectionExploration):
         spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Keyword Args:
-        lr (float): learning rate of φ.
+        lr (float, optional): learning rate of φ; ``None``: the learner's.
         tau (float): EMA rate of the target encoder.
         metric (mapping): keyword arguments of the loss.
         **directions: see :class:`~torchrl_etl.exploration.DirectionExploration`.
@@ -34,14 +34,13 @@ class MetricExploration(DirectionExploration):
         self,
         spec: EnvironmentSpec,
         *,
-        lr: float,
+        lr: float | None,
         tau: float,
         metric: dict[str, Any],
         **directions: Any,
     ) -> None:
         super().__init__(spec, **directions)
-        check_real("(0, inf)", lr=lr)
-        check_real("(0, 1]", tau=tau)
+        check_real("(0, 1]", tau=tau)  # for a term without targets it may be None
         check_flag(**{"metric.delay_encoder": metric.get("delay_encoder", True)})
         self._lr, self._tau, self._metric = lr, tau, dict(metric)
 

@@ -11,7 +11,7 @@ from torchrl.envs.transforms.rnd import RunningMeanStd
 from torchrl.modules import MLP
 from torchrl.objectives import RNDLoss
 
-from torchrl_etl.checks import check_integer, check_real, check_sizes, naming
+from torchrl_etl.checks import check_integer, check_sizes, naming
 from torchrl_etl.envs import EnvironmentSpec
 from torchrl_etl.exploration.exploration import Exploration
 from torchrl_etl.learners.term import Term
@@ -34,7 +34,7 @@ class RNDExploration(Exploration):
     Keyword Args:
         features (int): outputs of the random network.
         hidden (sequence of int): widths of its layers and of the predictor's.
-        lr (float): learning rate of the predictor.
+        lr (float, optional): learning rate of the predictor; ``None``: the learner's.
         bonus (mapping): keyword arguments of :class:`~torchrl_etl.transforms.ScaledBonus`.
     """
 
@@ -46,13 +46,12 @@ class RNDExploration(Exploration):
         *,
         features: int,
         hidden: Sequence[int],
-        lr: float,
+        lr: float | None,
         bonus: Mapping[str, Any],
     ) -> None:
         super().__init__(spec)
         check_integer(1, features=features)
         check_sizes(hidden=hidden)
-        check_real("(0, inf)", lr=lr)
         target, predictor = (
             MLP(spec.observation_dim, features, num_cells=hidden, activation_class=nn.ReLU)
             for _ in range(2)

@@ -7,7 +7,7 @@ from functools import partial
 from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.baselines import DEPExploration
-from torchrl_etl.checks import check_integer, naming
+from torchrl_etl.checks import naming
 from torchrl_etl.methods.method import Method
 from torchrl_etl.training.stage import Stage
 
@@ -30,13 +30,10 @@ class DEP(Method):
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")
-        alone = self.options["dep_frames"]
         with naming("method.options"):
-            check_integer(0, dep_frames=alone)
-            controller = DEPExploration(
-                self.context.spec.action_spec,
-                **{**self.options, "dep_frames": self.context.actions(alone)},
-            )
+            controller = DEPExploration(self.context.spec.action_spec, **self.options)
+        alone = self.options["dep_frames"]
+        controller.dep_frames = self.context.actions(alone)
         learner = self.context.learner(
             wrap=lambda behavior: TensorDictSequential(behavior, controller),
             more=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},

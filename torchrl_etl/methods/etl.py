@@ -269,7 +269,6 @@ class ETL(Method):
         options = self.context.options("learn")["decoder"]
         with naming("learn.decoder"):
             check_choice("fine_tuning", mode := options["fine_tuning"], get_args(FineTuning))
-            check_real("(0, inf)", lr=options["lr"])
             if options["residual_std"] is not None:
                 check_real("(0, inf)", residual_std=options["residual_std"])
                 check_real("(0, 1]", residual=options["residual"])
