@@ -7,8 +7,12 @@ import torch
 from tensordict import TensorDict
 
 from tests.configs import rival
+from torchrl_etl.analysis import synergy_effects
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.sar import finished_episodes, rollouts
+from torchrl_etl.methods.sar import SAR, finished_episodes, rollouts
+from torchrl_etl.synergies import load_bundle
+from torchrl_etl.training import alone
+from torchrl_etl.training.loop import StopOnSignal
 
 
 def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
@@ -64,6 +68,28 @@ def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
     assert all(
         torch.equal(value, before[key]) for key, value in play.learner.actor.state_dict().items()
     )
+
+
+def test_sar_leaves_a_bundle_of_its_components_which_nothing_of_the_run_reads(
+    tmp_path, monkeypatch
+):
+    def prepared(run):
+        sar = Experiment(rival("sar", run)).method
+        alone(sar.prepare(StopOnSignal()))
+        return sar, sar.stage()
+
+    sar, stage = prepared(tmp_path / "a")
+    bundle, info = load_bundle(tmp_path / "a")
+    assert (info.kind, info.task, info.num_synergies) == ("sar", sar.played, 3)
+    assert info.facts["frames"] == 448 and info.facts["vaf"] > 0.5
+    ours, published = synergy_effects(bundle), synergy_effects(sar.decoder())
+    cosine = torch.nn.functional.cosine_similarity(ours, published, dim=-1)
+    assert (cosine.abs() > 0.9).all()
+
+    monkeypatch.setattr(SAR, "_save_bundle", lambda self, actions: None)
+    _, without = prepared(tmp_path / "b")
+    for name, value in without.learner.objective.state_dict().items():
+        assert torch.equal(value, stage.learner.objective.state_dict()[name])
 
 
 @pytest.mark.slow

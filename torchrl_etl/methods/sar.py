@@ -11,16 +11,19 @@ from safetensors.torch import load_file, save
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.baselines import SARDecoder, best_episodes
 from torchrl_etl.checks import check_integer, check_real, naming
-from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env
+from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.learners.sac import episode_numbers
 from torchrl_etl.methods.method import Method
 from torchrl_etl.objectives import DecoderLoss
+from torchrl_etl.synergies import SARSynergies
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.work import Work
 
@@ -32,6 +35,11 @@ class SAR(Method):
 
     Deviates: the frames of the rollouts are charged too, so they are few; the first of them,
     half at most, are the preview of whose returns the percentile is taken.
+
+    The policy acts through the map as published, which ends at the bounds in a clamp. The bundle in
+    the run folder has the same components as ``synergies=sar`` has them
+    (:class:`~torchrl_etl.synergies.SARSynergies`), for the viewer and for ETL's stage 2; nothing in
+    this run reads it.
 
     Options: ``play_task`` (another task of the same body), ``frames`` of play and
     ``rollout_frames`` after it, ``preview_episodes`` and ``percentile`` of their returns,
@@ -62,8 +70,9 @@ class SAR(Method):
                     f"method.options.play_task is {self.task}, whose actuators are not those of "
                     f"{config.env}; play on a task of the same body."
                 )
-        name, goal = (self.task, None) if self.task else (config.env, config.goal)
-        steps, simulators = episode_length(name, goal) or 0, config.collector.num_envs
+        played = (self.task, None) if self.task else (config.env, config.goal)
+        self.played = resolve_task(*played).env_id
+        steps, simulators = episode_length(*played) or 0, config.collector.num_envs
         if self.rollout_frames < (needed := steps * max(2, simulators)):
             raise ValueError(
                 f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "
@@ -79,7 +88,10 @@ class SAR(Method):
         if not self.file.is_file():
             play = self.play_stage()
             yield from self.context.run_stage(play, stop)
-            decoder = self.fit(self.best(rollouts(play, self.rollout_frames, stop.check)))
+            actions = self.best(rollouts(play, self.rollout_frames, stop.check))
+            decoder = self.fit(actions)
+            self._save_bundle(actions)
+            # Last, since it says that all of this is done.
             write_atomically(self.file, save(decoder.state_dict()))
         return {}
 
@@ -112,14 +124,39 @@ class SAR(Method):
         bounds = {"low": spec.low, "high": spec.high}
         return SARDecoder.fit(actions, self.num_synergies, **bounds, blend=self.blend, seed=seed)
 
-    def stage(self) -> Stage:
+    def _save_bundle(self, actions: Tensor) -> None:
+        context = self.context
+        spec, seed = context.spec, context.config.seed
+        model = SARSynergies(spec.low, spec.high, self.num_synergies, seed=seed)
+        model.fit(actions)
+        vaf = variance_accounted_for(actions, model.reconstruct(actions))
+        model.save(
+            context.folder.synergies,
+            actions,
+            task=self.played,
+            actuators=spec.actuators,
+            facts={"vaf": vaf, "frames": self.charged, "seed": seed, **facts()},
+        )
+
+    def decoder(self) -> SARDecoder | None:
+        if not self.file.is_file():
+            return None
+        decoder = self._placeholder()
+        decoder.load_state_dict(load_file(self.file))
+        return decoder
+
+    def _placeholder(self) -> SARDecoder:
+        """The decoder before play has said what it decodes to."""
         spec = self.context.spec
         blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
         bounds = {"low": spec.low, "high": spec.high}
         with naming("method.options"):
-            decoder = SARDecoder(blank[0], blank[1:], **bounds, blend=self.blend)
-        if self.file.is_file():
-            decoder.load_state_dict(load_file(self.file))
+            return SARDecoder(blank[0], blank[1:], **bounds, blend=self.blend)
+
+    def stage(self) -> Stage:
+        decoder = self.decoder()
+        if decoder is None:
+            decoder = self._placeholder()
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder.to(self.context.device),
