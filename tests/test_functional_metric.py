@@ -159,7 +159,7 @@ def minimum_of_eq6(form: str, weight: float, target: float) -> float:
     zero = torch.zeros_like(distance)
     embedding = distance.unsqueeze(-1), zero.unsqueeze(-1)
     regularizer = F.discriminability(zero, zero, *embedding, 0.1, 1.0, form)  # type: ignore[arg-type]
-    whole = F.encoder_loss(F.metric_loss(distance, zero + target), regularizer, weight)
+    whole = F.metric_loss(distance, zero + target) + weight * regularizer
     return distance[whole.argmin()].item()
 
 

@@ -11,7 +11,6 @@ __all__ = [
     "direction_bonus",
     "discriminability",
     "effective_rank",
-    "encoder_loss",
     "expected_distance",
     "gaussian_w2",
     "l2_distance",
@@ -275,28 +274,6 @@ def discriminability(
         raise ValueError(f"form must be 'hinge' or 'literal', got {form!r}.")
     alike = (reward_i - reward_j).abs() < epsilon
     return torch.where(alike, penalty, torch.zeros_like(penalty))
-
-
-def encoder_loss(metric: Tensor, regularizer: Tensor, weight: float) -> Tensor:
-    r"""The state encoder's whole objective: metric loss plus weighted regularizer.
-
-    Args:
-        metric (Tensor): :func:`metric_loss`, ``[*]``.
-        regularizer (Tensor): :func:`discriminability`, ``[*]``.
-        weight (float): :math:`\lambda`.
-
-    Returns:
-        Tensor: losses, ``[*]``.
-
-    Equation: 6
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_etl.functional import encoder_loss
-        >>> encoder_loss(torch.tensor(2.0), torch.tensor(4.0), 0.5)
-        tensor(4.)
-    """
-    return metric + weight * regularizer
 
 
 def effective_rank(embedding: Tensor) -> Tensor:
