@@ -45,8 +45,9 @@ def filled(seed: int, name: str, compile: bool, env: str) -> Stage:
 def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, list[float]]:
     """Milliseconds an update of one seed, block by block; one unrecorded block comes first.
 
-    All blocks together are one call of ``together``, since it is what compiles. The work of the
-    first seed therefore looks at the clock, and has the seeds updated one after another meanwhile.
+    All blocks together are one call of ``together``, since it holds what is compiled. The work of
+    the first seed therefore looks at the clock, and has the seeds updated one after another
+    meanwhile.
     """
     seconds: dict[str, list[float]] = {"one_by_one": [], "together": []}
 
@@ -61,7 +62,7 @@ def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, lis
             seconds["together"].append(time.process_time() - middle)
 
     others = [training(stage, (repeats + 1) * block, at_once=AT_ONCE) for stage in stages[1:]]
-    for result in together([first(), *others]):
+    for result in together([first(), *others], joint=True):
         if isinstance(result, BaseException):
             raise result
     updates = block * len(stages)

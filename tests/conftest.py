@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+from types import SimpleNamespace
 
 import pytest
+
+from torchrl_etl.learners import compiled
 
 
 def pytest_collection_finish() -> None:
@@ -20,3 +23,12 @@ def no_waiting_for_the_disk() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         yield
+
+
+@pytest.fixture
+def traced_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled functions run the graph that was traced as it is; one that cannot be fails."""
+    monkeypatch.setattr(compiled._inductor, "compile", lambda graph, inputs: graph)
+    monkeypatch.setattr(
+        compiled, "warnings", SimpleNamespace(warn=lambda text, *_, **__: pytest.fail(text))
+    )

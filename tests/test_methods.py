@@ -17,6 +17,7 @@ from torchrl_etl.baselines import DEPExploration
 from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.methods import METHODS as CLASSES
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
@@ -148,17 +149,15 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice", "lattice_plain"])
-def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method):
+def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method, traced_only):
     stage = method_stage(method)
     fill(stage)
     batch, gradients = stage.sample(), stage.learner.gradients
     stage.close()
-    with torch._dynamo.config.patch(trace_autograd_ops=True):
-        traced = torch.compile(gradients, fullgraph=True, backend="aot_eager")
-        outs = []
-        for call in (gradients, traced):
-            torch.manual_seed(0)
-            outs.append(call(batch.clone()))
+    outs = []
+    for call in (gradients, compiled(gradients)):
+        torch.manual_seed(0)
+        outs.append(call(batch.clone()))
     (expected, logged), (found, logged_too) = outs
     torch.testing.assert_close(found, expected)
     for key, value in logged.items():

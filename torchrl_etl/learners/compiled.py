@@ -4,26 +4,36 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any
 
 import torch
 from tensordict.nn import CudaGraphModule
+from torch import Tensor, _inductor
+from torch._guards import TracingContext, tracing
+from torch._subclasses import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
-__all__ = ["compiled", "cuda_graph", "in_turn"]
+__all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Trace a function into one graph at its first call, its backward pass included.
+    """Trace a function of tensors or tensordicts into one graph at its first call, and compile it.
 
     With :func:`torch.autograd.grad` inside the graph nothing has to be kept between a forward and
     a backward half: on CPUs without AVX-512 the masks of rectifiers, kept as booleans, would cost
     as much as a third of the products.
 
-    It draws from PyTorch's generator as it would uncompiled, so the numbers are the same.
+    It is traced by running it (:func:`~torch.fx.experimental.proxy_tensor.make_fx`), so that what
+    TensorDict does in Python costs no more than once, and is compiled anew for inputs of other
+    sizes. Whatever else it reads must stay the same tensors, whose values may change, and no branch
+    may depend on values. It draws from PyTorch's generator as it would uncompiled, so the numbers
+    are the same.
 
     Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
     the compiler does not know) costs a warning that says why; the function then runs uncompiled,
@@ -36,21 +46,22 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         >>> slope(x)  # doctest: +SKIP
         tensor([2., 2., 2.])
     """
-    traced: Callable[..., Any] | None = None
+    graphs: list[tuple[Any, Callable[..., Any]]] = []
     failed = False
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        nonlocal traced, failed
+        nonlocal failed
         if failed:
             return function(*args)
+        leaves, spec = tree_flatten(args)
+        kind = spec, [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
         try:
-            if traced is None:
-                traced = torch.compile(
-                    function, fullgraph=True, isolate_recompiles=True, options=_options()
-                )
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
-                return traced(*args)
+            graph = next((graph for known, graph in graphs if known == kind), None)
+            if graph is None:
+                graph = _graph(function, spec, leaves)
+                graphs.append((kind, graph))
+            return graph(leaves)
         except Exception as error:
             failed = True
             warnings.warn(
@@ -63,20 +74,32 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def in_turn(update: Callable[[Any], Any], arguments: Iterable[Any]) -> list[Any]:
-    """What an update returns for each of these, as :func:`map` would, faster where it is compiled.
+def _graph(
+    function: Callable[..., Any], spec: TreeSpec, inputs: list[Tensor]
+) -> Callable[[list[Tensor]], Any]:
+    """The function of arguments like these, given their tensors, as one compiled graph."""
+    returned: TreeSpec | None = None
 
-    Compiled functions look at their guards at the first call alone: nothing may change from one
-    call to the next but what tensors hold.
+    def flat(*leaves: Tensor) -> list[Any]:
+        nonlocal returned
+        out, returned = tree_flatten(function(*tree_unflatten(list(leaves), spec)))
+        return out
 
-    Examples:
-        >>> in_turn(lambda x: x + 1, [1, 2, 3])
-        [2, 3, 4]
-    """
-    calls = map(update, arguments)
-    results = [next(calls)]
-    with torch.compiler.set_stance(skip_guard_eval_unsafe=True):
-        return [*results, *calls]
+    # No size is a symbol, but inductor (torch 2.13) caches nothing where none could be.
+    fake = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
+    stand_ins = [fake.from_tensor(each, static_shapes=True) for each in inputs]
+    with torch.random.fork_rng():  # a compiler draws numbers of its own
+        # As under torch.compile, nothing looks at values to check them.
+        with torch.compiler._compile_session_context():
+            traced = make_fx(flat, _allow_non_fake_inputs=True)(*stand_ins)
+        with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(_options()):
+            run = _inductor.compile(traced, stand_ins)
+
+    def call(leaves: list[Tensor]) -> Any:
+        with torch.no_grad():
+            return tree_unflatten(run(*leaves), returned)
+
+    return call
 
 
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -20,7 +20,7 @@ from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
 from torchrl_etl.learners.adam import GradientAdam
-from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
+from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.term import Term
@@ -160,7 +160,7 @@ class SACLearner:
 
     def updates(self, batches: TensorDictBase) -> TensorDictBase:
         """Learn from batches [k, B], one after the other; returns scalars to log [k]."""
-        return torch.stack(in_turn(self.update, batches))
+        return torch.stack([self.update(batch) for batch in batches])
 
     def step(self, batch: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.func import functional_call
 from torchrl.checkpoint import GlobalRNGState
 
 from torchrl_etl.draws import Draw, given_draws, recorded_draws
-from torchrl_etl.learners.compiled import compiled, cuda_graph, in_turn
+from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.sac import SACLearner
 
 __all__ = ["SideBySide"]
@@ -66,12 +64,6 @@ class SideBySide:
             )
         self.learners = list(learners)
         self._draws: list[Draw] | None = None
-        named = learners[0].objective.named_modules()
-        self._holders = {
-            tuple(name.split(".")): module
-            for name, module in named
-            if isinstance(module, TensorDictParams)
-        }
         first = learners[0]
         self._gradients = compiled(self.gradients) if first.compile else self.gradients
         graphed = first.compile and first.device.type == "cuda"
@@ -112,7 +104,7 @@ class SideBySide:
             list of TensorDictBase: the scalars [k] of each.
         """
         turns = zip(zip(*batches, strict=True), zip(*draws, strict=True), strict=True)
-        scalars = in_turn(lambda turn: self.update(*turn), turns)
+        scalars = [self.update(*turn) for turn in turns]
         return [torch.stack(list(own)) for own in zip(*scalars, strict=True)]
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
@@ -134,43 +126,20 @@ class SideBySide:
         objectives = [learner.objective for learner in self.learners]
         # Stacked anew each time: gradients then flow back to the learners' own parameters.
         params = torch.stack([TensorDict.from_module(each) for each in objectives])
-        held = [params.pop(path) for path in self._holders]
-        rest = dict(params.flatten_keys(".").items())
         first, draws = objectives[0], inputs["draws"]
         order = [draws[f"{i}"] for i in range(len(draws.keys()))]
 
         def objective(
-            held: list[TensorDictBase], rest: dict[str, Tensor], batch: TensorDictBase, given: Any
+            params: TensorDictBase, batch: TensorDictBase, given: Any
         ) -> tuple[Tensor, TensorDictBase]:
-            with _Holding(self._holders.values(), held), given_draws(given):
-                return functional_call(first, rest, (batch,), tie_weights=False)
+            with params.to_module(first, preserve_module_state=False), given_draws(given):
+                return first(batch)
 
-        losses, scalars = torch.vmap(objective)(held, rest, inputs["batch"], order)
+        losses, scalars = torch.vmap(objective)(params, inputs["batch"], order)
         parameters = [p for learner in self.learners for p in learner.parameters]
         flat = torch.autograd.grad(losses.sum(), parameters, allow_unused=True)
         count = len(self.learners[0].parameters)
         return [flat[i : i + count] for i in range(0, len(flat), count)], scalars.detach()
-
-
-class _Holding(AbstractContextManager):
-    """Lets modules that are nothing but parameters hold others.
-
-    ``functional_call`` does not know them; ``to_module`` cannot be compiled (tensordict 0.14.3).
-    """
-
-    def __init__(
-        self, holders: Iterable[TensorDictParams], params: Sequence[TensorDictBase]
-    ) -> None:
-        self.holders, self.params = list(holders), params
-
-    def __enter__(self) -> None:
-        self.before = [holder._param_td for holder in self.holders]
-        for holder, params in zip(self.holders, self.params, strict=True):
-            holder._param_td = params
-
-    def __exit__(self, *error: Any) -> None:
-        for holder, params in zip(self.holders, self.before, strict=True):
-            holder._param_td = params
 
 
 def stacked(batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]) -> TensorDictBase:

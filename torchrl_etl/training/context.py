@@ -100,7 +100,7 @@ class Context:
         if compile is None:  # what it takes to begin must pay
             with naming(section):
                 check_budget(options["frames"], options["replay_ratio"])
-            compile = options["frames"] * options["replay_ratio"] >= 10_000
+            compile = options["frames"] * options["replay_ratio"] >= 4_000
         configured["sac"]["compile"] = compile
         random = options.get("init_random_frames", 0)
         with naming(section):

@@ -15,13 +15,23 @@ from torchrl_etl.training.work import Due, Result, Work, alone
 __all__ = ["together"]
 
 
-def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
-    """Do all works in turns, and updates that are due at the same time as one unless compiled.
+def together(
+    works: Sequence[Work[Result]], *, joint: bool | None = None
+) -> list[Result | BaseException]:
+    """Do all works in turns, and updates that are due at the same time as one if ``joint``.
 
     Each work finds the random generators as it left them, and its updates get the random numbers
     that it would have drawn for them by itself: it ends with the numbers of
     :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
     the others to go on.
+
+    Args:
+        works (sequence of generator): runs or stages, as :func:`~torchrl_etl.training.work.alone`
+            takes one.
+
+    Keyword Args:
+        joint (bool, optional): one pass through the networks of all. Default: unless updates are
+            compiled for a CPU, which is no faster in one pass than one after another.
 
     Returns:
         list: what each work returned, or the exception that ended it.
@@ -38,7 +48,7 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
             for alike in dict.fromkeys(run.alike for run in waiting):
-                _update([run for run in waiting if run.alike == alike], groups)
+                _update([run for run in waiting if run.alike == alike], groups, joint)
     finally:
         for run in runs:
             run.work.close()
@@ -74,10 +84,12 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, error
 
 
-def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
+def _update(runs: Sequence[_Run], groups: dict[str, SideBySide], joint: bool | None) -> None:
     """Update the learners of these runs, which are in the same stage."""
-    # The pass over several does not compile (torch 2.13): compiled, each by itself is faster.
-    if len(runs) == 1 or runs[0].due.learner.compile:
+    if joint is None:
+        learner = runs[0].due.learner
+        joint = not learner.compile or learner.device.type != "cpu"
+    if len(runs) == 1 or not joint:
         for run in runs:
             with run:
                 scalars = run.due.learner.updates(run.due.batches)
