@@ -12,6 +12,7 @@ with their defaults:
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from collections.abc import Iterator
@@ -110,10 +111,11 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     for key in ("return", "solved", "solved_time"):
         if key in learned:
             value = learned[key]
+            known = not math.isnan(value["low"])  # one episode alone has no interval
+            interval = f"95% interval {value['low']:.2f} to {value['high']:.2f}, " if known else ""
             lines.append(
                 f"  {key:<12}{value['before']:.2f} before, {value['after']:.2f} after "
-                f"(95% interval {value['low']:.2f} to {value['high']:.2f}, "
-                f"{learned['frames_charged']:,} frames)"
+                f"({interval}{learned['frames_charged']:,} frames)"
             )
     if (folder / "pictures").exists():
         lines.append(f"  pictures    {folder / 'pictures'}")
