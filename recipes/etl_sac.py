@@ -12,7 +12,6 @@ with their defaults:
 
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 from collections.abc import Iterator
@@ -28,6 +27,7 @@ from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import (
     OPENING_FAULTS,
     check_overrides,
+    interval_in_words,
     one_sentence,
     quiet_torchrl,
     quote_paths,
@@ -111,11 +111,11 @@ def report(summary: dict[str, Any], folder: Path) -> str:
     for key in ("return", "solved", "solved_time"):
         if key in learned:
             value = learned[key]
-            known = not math.isnan(value["low"])  # one episode alone has no interval
-            interval = f"95% interval {value['low']:.2f} to {value['high']:.2f}, " if known else ""
+            interval = interval_in_words(value["low"], value["high"], digits=2)
+            known = filter(None, (interval, f"{learned['frames_charged']:,} frames"))
             lines.append(
                 f"  {key:<12}{value['before']:.2f} before, {value['after']:.2f} after "
-                f"({interval}{learned['frames_charged']:,} frames)"
+                f"({', '.join(known)})"
             )
     if (folder / "pictures").exists():
         lines.append(f"  pictures    {folder / 'pictures'}")

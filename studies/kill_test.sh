@@ -28,15 +28,18 @@ queue() {
     out=$out jobs="${JOBS:-1}" settings="$(echo $settings)"
 }
 
+control() { # of etl_body: its name, and what makes its synergies
+  oracle=runs/oracles/body_$1-$task method=etl_body_$1
+  shift
+  [ -d "$oracle" ] || $python studies/body_synergies.py "$task" "$oracle" "$@"
+  queue "$method"
+}
+
 queue sac
 queue etl
 queue etl_body
-for control in "shuffled --shuffle 0" "still --still"; do
-  name=body_${control%% *}
-  [ -d "runs/oracles/$name-$task" ] ||
-    $python studies/body_synergies.py "$task" "runs/oracles/$name-$task" ${control#* }
-  queue etl_$name
-done
+control shuffled --shuffle 0
+control still --still
 learned=$out/$task-sac-seed0
 for model in gmvae pca; do
   oracle=runs/oracles/learned_$model-$task

@@ -8,8 +8,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchrl_etl.learners import compiled
-
 
 def pytest_collection_finish() -> None:
     """Let the garbage collector pass over what was imported, which lives as long as the tests."""
@@ -28,6 +26,9 @@ def no_waiting_for_the_disk() -> None:
 @pytest.fixture
 def traced_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions run the graph that was traced as it is; one that cannot be fails."""
+    # Not at the top: the process that only hands tests out loads this file too.
+    from torchrl_etl.learners import compiled
+
     monkeypatch.setattr(compiled._inductor, "compile", lambda graph, inputs: graph)
     monkeypatch.setattr(
         compiled, "warnings", SimpleNamespace(warn=lambda text, *_, **__: pytest.fail(text))

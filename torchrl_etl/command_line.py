@@ -28,6 +28,7 @@ with extra("recipes"):
 __all__ = [
     "OPENING_FAULTS",
     "check_overrides",
+    "interval_in_words",
     "one_sentence",
     "print_intervals",
     "quiet_torchrl",
@@ -174,10 +175,14 @@ def print_intervals(summary: Mapping[str, Any]) -> None:
     """Print return and solved, as :meth:`~torchrl_etl.training.Evaluation.summary` has them."""
     for key in ("return", "solved", "solved_time"):
         if key in summary:
-            mean, low, high = summary[key].values()
-            known = not math.isnan(low)  # one episode alone has no interval
-            interval = f"  (95% interval {low:.3f} to {high:.3f})" if known else ""
-            print(f"  {key:<12} {mean:.3f}{interval}")
+            mean, *ends = summary[key].values()
+            interval = interval_in_words(*ends, digits=3)
+            print(f"  {key:<12} {mean:.3f}" + (f"  ({interval})" if interval else ""))
+
+
+def interval_in_words(low: float, high: float, digits: int) -> str:
+    """The ends of a 95 % interval; nothing for one episode alone, which has none."""
+    return "" if math.isnan(low) else f"95% interval {low:.{digits}f} to {high:.{digits}f}"
 
 
 def quiet_torchrl() -> None:

@@ -101,13 +101,12 @@ class ETL(Method):
 
     def _settle_given(self) -> None:
         """Look at the synergies that were given; those of the body are made, once in a run."""
-        config, space, given = self.context.config, self.context.spec, self.context.config.synergies
-        if given.bundle != BODY:  # the absolute path stands in the run's configuration
-            given.bundle = str(bundle_path(given.bundle))
-        self.explores_nothing()
-        config.synergies, config.stage = {"kind": None, "bundle": given.bundle}, "learn"
-        own = self.context.folder.synergies
-        if given.bundle == BODY and not surviving_folder(own).exists():
+        config, space = self.context.config, self.context.spec
+        given, own = config.synergies.bundle, self.context.folder.synergies
+        # The absolute path stands in the run's configuration.
+        self.explores_nothing(bundle=given if given == BODY else str(bundle_path(given)))
+        config.stage = "learn"
+        if given == BODY and not surviving_folder(own).exists():
             with closing(self.context.make_env(seed=0)) as env:
                 env.reset()
                 self.of_body = body_synergies(env, config.num_synergies)

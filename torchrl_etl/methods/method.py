@@ -67,12 +67,13 @@ class Method(ABC):
                 )
         if not self.has_synergies:
             self.explores_nothing()
-            config.synergies = {"kind": None, "bundle": None}
 
-    def explores_nothing(self) -> None:
+    def explores_nothing(self, bundle: str | None = None) -> None:
         """Say so in the run's configuration: there is no stage 1 whose settings would hold."""
-        self.context.config.exploration = {"kind": None}
-        self.context.config.learn.prefill = False
+        config = self.context.config
+        config.exploration = {"kind": None}
+        config.synergies = {"kind": None, "bundle": bundle}
+        config.learn.prefill = False
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         """Find out what :meth:`stage` needs and leave it in the run folder.
