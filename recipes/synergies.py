@@ -37,6 +37,7 @@ from torchrl_etl.synergies import (
     SynergyModel,
     fit_synergies,
     read_recording,
+    save_bundle,
 )
 
 CONF = Path(__file__).parent / "conf"
@@ -72,7 +73,7 @@ def main(config: DictConfig) -> None:
             print(f"{number:>10}  " + "  ".join(f"{value:>10.3f}" for value in found[number]))
         chosen = enough_synergies(found, config.vaf)
         folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
-        leave(folder, recording, kind, models[chosen], found, config)
+        leave(folder, recording, models[chosen], found, config)
     enough = found[chosen].held_out >= config.vaf
     print(
         f"{chosen} synergies account for {found[chosen].held_out:.0%} of held-out rows"
@@ -147,7 +148,6 @@ def numbers_of_synergies(num: Any, muscles: int) -> Sequence[int]:
 def leave(
     folder: Path,
     recording: Recording,
-    kind: str,
     model: SynergyModel,
     found: dict[int, CrossValidation],
     config: DictConfig,
@@ -159,11 +159,13 @@ def leave(
     rows.writerows((number, *found[number]) for number in found)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "vaf.csv", text.getvalue())
-    model.save(
+    decoder = model.decoder(recording.activity)
+    save_bundle(
+        decoder,
         folder / "synergies",
-        recording.activity,
         task=Path(config.data).stem,
         actuators=recording.muscles,
+        kind=model.kind,
         facts={
             "vaf": found[model.num_synergies].fitted,
             "vaf_held_out": found[model.num_synergies].held_out,
@@ -172,10 +174,9 @@ def leave(
         },
     )
     pictures = folder / "pictures"
-    decoder = model.decoder(recording.activity)
     synergy_heatmap(decoder, recording.muscles, pictures / "synergies.png")
     series = {
-        f"{kind.upper()}, fitted": [of.fitted for of in found.values()],
+        f"{model.kind.upper()}, fitted": [of.fitted for of in found.values()],
         "held out": [of.held_out for of in found.values()],
     }
     vaf_curve(list(found), series, pictures / "vaf.png", chosen_d=model.num_synergies)
