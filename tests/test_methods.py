@@ -250,6 +250,7 @@ def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_pa
         ("eme method.options.weight=-1", "method.options.weight is -1"),
         ("dep method.options.dep_frames=-1", "method.options.dep_frames is -1"),
         ("dep method.options.dep_frames=x", "method.options.dep_frames is 'x'"),
+        ("dep learn.learning_starts=x", "learn.learning_starts is 'x'"),
         ("dep method.options.probability=2", "method.options.probability is 2"),
         ("dep method.options.kappa=0", "method.options.kappa is 0"),
         ("sar method.options.blend=2", "method.options.blend is 2"),
@@ -269,9 +270,9 @@ def controller(stage) -> DEPExploration:
     return next(m for m in stage.learner.behavior.modules() if isinstance(m, DEPExploration))
 
 
-@pytest.mark.parametrize(("starts", "expected"), [(100, 640), (1000, 1000)])
-def test_dep_learns_from_when_it_has_acted_alone(starts, expected, tmp_path):
-    settings = ("method.options.dep_frames=640", f"learn.learning_starts={starts}")
+@pytest.mark.parametrize(("starts", "expected"), [((), 640), (("learn.learning_starts=100",), 100)])
+def test_dep_learns_from_when_it_has_acted_alone_or_is_told(starts, expected, tmp_path):
+    settings = ("method.options.dep_frames=640", *starts)
     workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
     run = rival("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
     experiment = Experiment(run)

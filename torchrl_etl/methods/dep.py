@@ -17,7 +17,8 @@ __all__ = ["DEP"]
 class DEP(Method):
     """SAC whose actor is followed by DEP's controller.
 
-    Learning starts when DEP has acted alone, as in the public code.
+    Learning starts when DEP has acted alone, as in the public code: ``learn.learning_starts`` is
+    ``dep_frames`` in its files of ``method/``.
 
     Deviates: its authors' learner is MPO; here it is SAC, the same as everyone's.
 
@@ -32,16 +33,12 @@ class DEP(Method):
         self.context.seed_everything("learn")
         with naming("method.options"):
             controller = DEPExploration(self.context.spec.action_spec, **self.options)
-        alone = self.options["dep_frames"]
-        controller.dep_frames = self.context.actions(alone)
+        controller.dep_frames = self.context.actions(self.options["dep_frames"])
         learner = self.context.learner(
             wrap=lambda behavior: TensorDictSequential(behavior, controller),
             more=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
         )
-        stage = self.context.stage(learner, env_options={"muscle_lengths": True})
-        stage.learning_starts = max(alone, stage.learning_starts)
-        self.context.config.learn.learning_starts = stage.learning_starts
-        return stage
+        return self.context.stage(learner, env_options={"muscle_lengths": True})
 
     def check(self) -> None:
         super().check()
