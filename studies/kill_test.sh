@@ -3,9 +3,9 @@
 # one of these also with its muscles shuffled, and without any, two controls.
 #
 #     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
-#     JOBS=2 sh studies/kill_test.sh               both seeds at a time
+#     JOBS=2 SEEDS=[0,1,2] sh studies/kill_test.sh      two runs at a time, three seeds
 #
-# A thread a run, two seeds, one after the other by default; rows go to docs/results/kill_test. Kill it at
+# A thread a run, seeds 0 and 1, one after the other by default; rows go to docs/results/kill_test. Kill it at
 # any time and start it again, here or on another machine: finished runs stay (the table alone is
 # enough), others go on from their checkpoints, and an oracle is made when what it needs is there.
 # It takes 1.5 to 2 hours a run on a free core with AVX2.
@@ -24,7 +24,7 @@ settings="learn.replay_ratio=0.125 learn.learning_starts=5000 learn.buffer_size=
   evaluation.every=25000 evaluation.episodes=5 checkpoint.every=50000 log_every=5000"
 
 queue() {
-  $python recipes/sweep.py "tasks=[$task]" "methods=[$1]" 'seeds=[0,1]' frames="$frames" \
+  $python recipes/sweep.py "tasks=[$task]" "methods=[$1]" "seeds=${SEEDS:-[0,1]}" frames="$frames" \
     out=$out jobs="${JOBS:-1}" settings="$(echo $settings)"
 }
 
