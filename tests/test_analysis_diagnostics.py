@@ -5,10 +5,8 @@ import torch
 from torch import nn
 
 from torchrl_etl.analysis.diagnostics import (
-    MixtureUsage,
     control_authority,
     direction_alignment,
-    mixture_usage,
     synergy_effects,
     synergy_warnings,
 )
@@ -59,21 +57,6 @@ def test_a_residual_is_not_counted_as_synergy():
     torch.testing.assert_close(synergy_effects(residual), synergy_effects(plain))
 
 
-def test_mixture_usage_tells_an_even_mixture_from_a_collapsed_one():
-    gmvae = GMVAE(6, 2, num_components=4)
-    final = gmvae.encoder[-1]
-    with torch.no_grad():
-        final.weight[:4] = 0.0
-        final.bias[:4] = 0.0
-        even = mixture_usage(gmvae, torch.rand(10, 6))
-        final.bias[2] = 50.0
-        collapsed = mixture_usage(gmvae, torch.rand(9000, 6))  # more than one piece
-    torch.testing.assert_close(even.shares, torch.full((4,), 0.25))
-    assert even.effective == pytest.approx(4.0, abs=1e-4)
-    torch.testing.assert_close(collapsed.shares, torch.tensor([0.0, 0.0, 1.0, 0.0]))
-    assert collapsed.effective == pytest.approx(1.0, abs=1e-4)
-
-
 def test_alignment_by_hand():
     along = torch.tensor([[3.0, 0.0], [-1.0, 0.0], [1.0, 2.0], [1.0, -2.0]])  # around (1, 0)
     ways = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -86,8 +69,7 @@ def test_alignment_by_hand():
 
 def test_each_fault_gets_its_own_sentence_with_its_numbers():
     good = {"vaf": 0.8, "pca_vaf": 0.75, "authority": torch.tensor([0.4, 0.6])}
-    even = MixtureUsage(torch.full((4,), 0.25), 4.0)
-    assert synergy_warnings(**good, usage=even) == []
+    assert synergy_warnings(**good) == []
     faults = {
         "hardly have synergies: the GMVAE accounts for 18%": {
             "vaf": 0.18,
@@ -95,10 +77,7 @@ def test_each_fault_gets_its_own_sentence_with_its_numbers():
         },
         "60.0% of the actions' variance, less than PCA's 75.0%": {"vaf": 0.6},
         "over 5% of its range": {"authority": torch.tensor([0.0, 0.1])},
-        "collapsed: 1.0 of its 4": {"usage": MixtureUsage(torch.eye(4)[0], 1.0)},
     }
     for words, fault in faults.items():
-        (sentence,) = synergy_warnings(**good | {"usage": even} | fault)
+        (sentence,) = synergy_warnings(**good | fault)
         assert words in sentence
-    one = MixtureUsage(torch.ones(1), 1.0)
-    assert synergy_warnings(**good, usage=one) == []  # a plain VAE cannot collapse

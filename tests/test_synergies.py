@@ -14,6 +14,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.synergies import (
     SYNERGY_MODELS,
+    GMVAESynergies,
     SynergyModel,
     fit_synergies,
     load_bundle,
@@ -229,6 +230,26 @@ def test_every_kind_is_described_and_drawn_under_its_name(kind: str, tmp_path) -
         dims=[1, 2],
     )
     assert {file.name for file in tmp_path.iterdir()} == {"synergies.png", "vaf.png"}
+
+
+def test_a_mixture_that_has_collapsed_is_told_from_an_even_one() -> None:
+    model = GMVAESynergies(-torch.ones(6), torch.ones(6), 2, num_components=4)
+    final = model.model.encoder[-1]
+    with torch.no_grad():
+        final.weight[:4] = 0.0
+        final.bias[:4] = 0.0
+    numbers, faults = model.describe(torch.rand(10, 6))
+    assert numbers == {"effective_components": pytest.approx(4.0, abs=1e-4)} and not faults
+    final.bias.data[2] = 50.0
+    actions = torch.rand(9000, 6)  # more than one piece
+    numbers, faults = describe_synergies(model, model.decoder(actions), actions)
+    assert numbers["effective_components"] == pytest.approx(1.0, abs=1e-4)
+    assert "collapsed: 1.0 of its 4 components are in use, the largest for 100%" in faults[-1]
+
+
+def test_a_mixture_of_one_component_cannot_collapse() -> None:
+    model = SYNERGY_MODELS["vae"](-torch.ones(6), torch.ones(6), 2)
+    assert model.describe(torch.rand(10, 6)) == ({"effective_components": pytest.approx(1.0)}, [])
 
 
 @pytest.mark.parametrize("kind", SYNERGY_MODELS)

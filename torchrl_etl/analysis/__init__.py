@@ -7,10 +7,8 @@ from torchrl_etl.analysis.cross_validation import (
     held_out_rows,
 )
 from torchrl_etl.analysis.diagnostics import (
-    MixtureUsage,
     control_authority,
     direction_alignment,
-    mixture_usage,
     synergy_effects,
     synergy_warnings,
 )
@@ -24,7 +22,6 @@ __all__ = [
     "CrossValidation",
     "Interval",
     "JointEffects",
-    "MixtureUsage",
     "control_authority",
     "cross_validate",
     "describe_synergies",
@@ -36,7 +33,6 @@ __all__ = [
     "interval",
     "joint_effects",
     "learning_curves",
-    "mixture_usage",
     "nmf_vaf",
     "pca_vaf",
     "success_interval",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,13 +12,11 @@ from torch import Tensor
 from torchrl_etl.analysis.arrays import as_array, as_matrix
 
 if TYPE_CHECKING:
-    from torchrl_etl.modules import GMVAE, SynergyDecoder
+    from torchrl_etl.modules import SynergyDecoder
 
 __all__ = [
-    "MixtureUsage",
     "control_authority",
     "direction_alignment",
-    "mixture_usage",
     "synergy_effects",
     "synergy_warnings",
 ]
@@ -83,39 +81,6 @@ def synergy_effects(decoder: SynergyDecoder) -> Tensor:
     return change / (decoder.high - decoder.low)
 
 
-class MixtureUsage(NamedTuple):
-    """Share of the actions in each component [C], and how many components that amounts to."""
-
-    shares: Tensor
-    effective: float
-
-
-@torch.no_grad()
-def mixture_usage(gmvae: GMVAE, actions: Tensor) -> MixtureUsage:
-    """Mean q(c|a) over ``actions``, and exp of its entropy: the effective number of components.
-
-    Args:
-        gmvae (GMVAE): the fitted model.
-        actions (Tensor): actions [*, n] in action units.
-
-    Raises:
-        ValueError: if there are no actions.
-
-    Examples:
-        >>> from torchrl_etl.modules import GMVAE
-        >>> usage = mixture_usage(GMVAE(39, 4), torch.rand(64, 39))
-        >>> usage.shares.shape, 1.0 <= usage.effective <= 4.001
-        (torch.Size([4]), True)
-    """
-    actions = actions.reshape(-1, actions.shape[-1])
-    if not len(actions):
-        raise ValueError("There are no actions to assign to components; pass at least one.")
-    # In pieces: all hidden layers at once would take far more memory than the answer.
-    shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
-    shares = shares / len(actions)
-    return MixtureUsage(shares, torch.special.entr(shares).sum().exp().item())
-
-
 def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | ArrayLike) -> float:
     """Whether episodes went where their directions point: mean cosine between φ(s) - mean φ and z.
 
@@ -156,11 +121,9 @@ def synergy_warnings(
     pca_vaf: float,
     authority: Tensor | ArrayLike,
     kind: str = "gmvae",
-    usage: MixtureUsage | None = None,
     min_vaf: float = 0.5,
     pca_tolerance: float = 0.02,
     min_authority: float = 0.2,
-    min_components: float = 1.5,
 ) -> list[str]:
     """Say in words what is wrong with a synergy space; an empty list means nothing was found.
 
@@ -169,12 +132,10 @@ def synergy_warnings(
         pca_vaf (float): variance that PCA accounts for with as many dimensions.
         authority (Tensor or array): what :func:`control_authority` returned [n].
         kind (str): of the synergy model. Default: ``"gmvae"``.
-        usage (MixtureUsage, optional): what :func:`mixture_usage` returned.
         min_vaf (float): least acceptable share of the variance, by the model or by PCA.
             Default: 0.5.
         pca_tolerance (float): how far the model may stay behind PCA. Default: 0.02.
         min_authority (float): lowest acceptable mean authority. Default: 0.2.
-        min_components (float): lowest acceptable effective number of components. Default: 1.5.
 
     Returns:
         list of str: one sentence per finding, with its numbers and what helps.
@@ -210,12 +171,6 @@ def synergy_warnings(
             f"The synergies move an actuator over {authority.mean():.0%} of its range on average "
             f"({min_authority:.0%} is the least advised{idle}): learn on them only with a "
             "residual, or fit them to actions that vary more."
-        )
-    if usage is not None and len(usage.shares) > 1 and usage.effective < min_components:
-        found.append(
-            f"The mixture has collapsed: {usage.effective:.1f} of its {len(usage.shares)} "
-            f"components are in use, the largest for {float(usage.shares.max()):.0%} of the "
-            "actions; lower the weight of the component KL, or ask for fewer components."
         )
     return found
 

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_etl.analysis.diagnostics import control_authority, mixture_usage, synergy_warnings
+from torchrl_etl.analysis.diagnostics import control_authority, synergy_warnings
 from torchrl_etl.analysis.pictures import synergy_heatmap, vaf_curve
 from torchrl_etl.analysis.variance import nmf_vaf, pca_vaf, variance_accounted_for
 from torchrl_etl.modules import SynergyMap
-from torchrl_etl.synergies import GMVAESynergies, SynergyModel
+from torchrl_etl.synergies import SynergyModel
 
 __all__ = ["describe_synergies", "draw_synergies"]
 
@@ -26,26 +26,23 @@ def describe_synergies(
 
     Returns:
         dict: ``vaf``, ``pca_vaf`` and ``nmf_vaf`` at the same d, ``control_authority`` (mean share
-        of an actuator's range that the decoder commands) and, of a mixture,
-        ``effective_components``.
+        of an actuator's range that the decoder commands), and what the model adds: see
+        :meth:`SynergyModel.describe <torchrl_etl.synergies.SynergyModel.describe>`.
         list of str: what is wrong with it, in words.
     """
     authority = control_authority(decoder)
     vaf = variance_accounted_for(actions, model.reconstruct(actions))
     pca = pca_vaf(actions, model.num_synergies)
+    own, faults = model.describe(actions)
     numbers: dict[str, Any] = {
         "vaf": vaf,
         "pca_vaf": pca,
         "nmf_vaf": nmf_vaf(actions, model.num_synergies, low=decoder.low),
         "control_authority": authority.mean().item(),
+        **own,
     }
-    usage = None
-    if isinstance(model, GMVAESynergies):
-        usage = mixture_usage(model.model, actions)
-        numbers["effective_components"] = usage.effective
-    return numbers, synergy_warnings(
-        vaf=vaf, pca_vaf=pca, authority=authority, kind=model.kind, usage=usage
-    )
+    found = synergy_warnings(vaf=vaf, pca_vaf=pca, authority=authority, kind=model.kind)
+    return numbers, found + faults
 
 
 def draw_synergies(

@@ -15,7 +15,9 @@ from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.objectives import GMVAELoss
 from torchrl_etl.synergies.model import SynergyModel
 
-__all__ = ["GMVAESynergies", "fit_gmvae"]
+__all__ = ["GMVAESynergies", "component_shares", "fit_gmvae"]
+
+_LEAST_COMPONENTS = 1.5
 
 
 class GMVAESynergies(SynergyModel):
@@ -74,6 +76,32 @@ class GMVAESynergies(SynergyModel):
 
     def reconstruct(self, actions: Tensor) -> Tensor:
         return self.model.reconstruct(actions)
+
+    def describe(self, actions: Tensor) -> tuple[dict[str, float], list[str]]:
+        """``effective_components``: exp of the entropy of the mean q(c|a); too few is a fault."""
+        shares = component_shares(self.model, actions)
+        effective = torch.special.entr(shares).sum().exp().item()
+        faults = []
+        if len(shares) > 1 and effective < _LEAST_COMPONENTS:
+            faults.append(
+                f"The mixture has collapsed: {effective:.1f} of its {len(shares)} components are "
+                f"in use, the largest for {float(shares.max()):.0%} of the actions; lower the "
+                "weight of the component KL, or ask for fewer components."
+            )
+        return {"effective_components": effective}, faults
+
+
+@torch.no_grad()
+def component_shares(gmvae: GMVAE, actions: Tensor) -> Tensor:
+    """Share of the actions [N, n] in each component [C]: mean q(c|a).
+
+    Examples:
+        >>> component_shares(GMVAE(39, 4), torch.rand(64, 39)).sum().round()
+        tensor(1.)
+    """
+    # In pieces: all hidden layers at once would take far more memory than the answer.
+    shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
+    return shares / len(actions)
 
 
 def fit_gmvae(

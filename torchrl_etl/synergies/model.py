@@ -53,6 +53,14 @@ class SynergyModel(ABC):
     def reconstruct(self, actions: Tensor) -> Tensor:
         """Actions [*, n] rebuilt from their d coefficients."""
 
+    def describe(self, actions: Tensor) -> tuple[dict[str, float], list[str]]:
+        """What a kind knows of itself on actions [N, n]: numbers, and in words what is wrong.
+
+        What every kind has is in :func:`~torchrl_etl.analysis.describe_synergies`, which adds this.
+        Which muscles a synergy moves is the decoder's to tell: it has no model once it is loaded.
+        """
+        return {}, []
+
     def save(
         self,
         path: str | os.PathLike[str],
