@@ -10,7 +10,7 @@ from torchrl_etl.analysis.diagnostics import (
     synergy_effects,
     synergy_warnings,
 )
-from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules import SynergyDecoder
 
 
 class LinearDecoder(nn.Module):
