@@ -110,45 +110,29 @@ class SACLearner:
         on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
     ) -> None:
-        check_real("[0, 1)", gamma=gamma, ema_decay=ema_decay)
-        check_real("(0, 1]", tau=tau)
-        check_real("[0, 1]", lr_end=lr_end)
-        check_real("(0, inf)", lr=lr, alpha_init=alpha_init)
-        check_integer(1, num_critics=num_critics, bins=bins)
+        check_rates(lr, lr_end, tau, ema_decay)
         check_flag(unit_rows=unit_rows)
-        self.gamma, self.lr_end, self.device = gamma, lr_end, next(actor.parameters()).device
+        self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
+        self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
         self.on_frames, self.on_restart = on_frames, on_restart
+        decoded = {"action_spec": action_spec, "decoder": decoder, "train_decoder": train_decoder}
+        entropy = {"target_entropy": target_entropy, "alpha_init": alpha_init}
+        critics = {"num_critics": num_critics, "bins": bins, "loss_function": loss_function}
+        sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
         scale = make_return_scale(gamma, return_bound)
-        sac = make_loss(
-            actor,
-            critic,
-            decoder,
-            train_decoder=train_decoder,
-            action_spec=action_spec,
-            target_entropy=target_entropy,
-            alpha_init=alpha_init,
-            num_qvalue_nets=num_critics,
-            loss_function=loss_function,
-            support=support(bins, return_bound),
-        )
-        self.objective = Objective(
-            sac, actor, terms, normalizer=normalizer, return_scale=scale, reward=reward
-        ).to(self.device)
-        sac.make_value_estimator(gamma=gamma)
-        _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
+        units = {"normalizer": normalizer, "return_scale": scale, "reward": reward}
+        self.objective = Objective(sac, actor, terms, **units).to(self.device)
         self.targets = [FusedSoftUpdate(sac, tau=tau)]
         self.targets += [term.target for term in terms if term.target is not None]
         self.ema = WarmedUpEMA(actor, ema_decay)
         acting = actor if behavior is None else behavior
         self.behavior = from_observation(acting, normalizer, decoder)
         self.policy = from_observation(self.ema.module, normalizer, decoder)
-        self.actor, self.decoder = actor, decoder
         self.unit_rows = list(linear_weights(sac)) if unit_rows else []
         normalize_rows(self.unit_rows)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
-        self.compile = compile
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
@@ -224,18 +208,40 @@ class SACLearner:
         }
 
 
+def check_rates(lr: float, lr_end: float, tau: float, ema_decay: float) -> None:
+    """Refuse what no learning rate and no EMA can be."""
+    check_real("(0, inf)", lr=lr)
+    check_real("[0, 1]", lr_end=lr_end)
+    check_real("(0, 1]", tau=tau)
+    check_real("[0, 1)", ema_decay=ema_decay)
+
+
 def make_loss(
     actor: ProbabilisticTensorDictSequential,
     critic: TensorDictModule,
-    decoder: SynergyMap | None,
+    gamma: float,
+    return_bound: float | None,
     *,
+    decoder: SynergyMap | None,
     train_decoder: bool,
+    alpha_init: float,
+    num_critics: int,
+    bins: int,
     **options: Any,
 ) -> LeanSACLoss:
     """SAC's losses, of actions or of the synergies that a decoder turns into actions."""
+    check_real("[0, 1)", gamma=gamma)
+    check_real("(0, inf)", alpha_init=alpha_init)
+    check_integer(1, num_critics=num_critics, bins=bins)
+    options |= {"alpha_init": alpha_init, "num_qvalue_nets": num_critics}
+    options["support"] = support(bins, return_bound)
     if decoder is None:
-        return LeanSACLoss(actor, critic, **options)
-    return SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
+        sac = LeanSACLoss(actor, critic, **options)
+    else:
+        sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
+    sac.make_value_estimator(gamma=gamma)
+    _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
+    return sac
 
 
 def make_return_scale(gamma: float, return_bound: float | None) -> ReturnScale | None:

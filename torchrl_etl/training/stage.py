@@ -17,7 +17,7 @@ from torch import nn
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, Storage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, make_batches
@@ -128,34 +128,25 @@ class Stage:
         check_choice("buffer_storage", buffer_storage, ("memory", "memmap"))
         self.name, self.learner, self.seed, self.device = name, learner, seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
-        self.restart_seed = restart_seed
-        self._update = update
         self.batch_size, self.replay_ratio = batch_size, replay_ratio
-        self.learning_starts = learning_starts
+        self.learning_starts, self.restart_seed = learning_starts, restart_seed
+        self._update = update
         self.progress = Progress()
         self.batches: Batches | None = None
-        self._make_batches = partial(
-            make_batches, **collector, make_env=make_env, policy=learner.behavior, device=device
-        )
+        acting = {"make_env": make_env, "policy": learner.behavior, "device": device}
+        self._make_batches = partial(make_batches, **collector, **acting)
         per_batch = collector["frames_per_batch"]
         self._frames_per_action = frames_per_action(collector, action_repeat)
         self._most_updates = math.ceil(2 * replay_ratio * action_repeat * per_batch)
         room = min(buffer_size, prefill_size + frames // action_repeat + per_batch)
-        self.buffer = TensorDictReplayBuffer(
-            storage=make_storage(
-                room, device, scratch / name if buffer_storage == "memmap" else None
-            )
-        )
+        storage = make_storage(room, device, scratch / name if buffer_storage == "memmap" else None)
+        self.buffer = TensorDictReplayBuffer(storage=storage, transform=Compose(*transforms))
         self.transforms = nn.ModuleList(transforms)
-        for transform in transforms:
-            self.buffer.append_transform(transform)
         # What a transform makes of a batch may depend on the updates before it: a bonus does.
         self._at_once = 1 if transforms else AT_ONCE
-        self._kept = [*TRANSITION, *keep]
-        self.multi_step = None
-        if n_steps > 1:
-            self.multi_step = ContinuedMultiStep(learner.gamma, n_steps)
-            self._kept.append("steps_to_next_obs")
+        several = n_steps > 1
+        self.multi_step = ContinuedMultiStep(learner.gamma, n_steps) if several else None
+        self._kept = [*TRANSITION, *keep, *(("steps_to_next_obs",) if several else ())]
 
     @property
     def frames(self) -> int:
