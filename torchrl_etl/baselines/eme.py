@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -17,6 +16,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_uniform
+from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import outputs, partners
 
@@ -116,19 +116,7 @@ class EMELoss(LossModule):
         >>> updater.step()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that :meth:`set_keys` can change; both are read below ``"next"``.
-
-        Attributes:
-            reward (NestedKey): the task's own reward. Default: ``"reward"``.
-            terminated (NestedKey): end of the episode in a terminal state.
-                Default: ``"terminated"``.
-        """
-
-        reward: NestedKey = "reward"
-        terminated: NestedKey = "terminated"
-
+    _AcceptedKeys = BehavioralMetricLoss._AcceptedKeys  # the two metrics read the same
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
 
