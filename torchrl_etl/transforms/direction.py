@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,21 +13,12 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_etl.checks import check_choice, check_integer
-from torchrl_etl.transforms.keys import (
-    group_reset,
-    group_shape,
-    refuse_shared_keys,
-    set_leaf,
-)
-
-if TYPE_CHECKING:
-    from torchrl.envs import EnvBase
-    from torchrl.envs.transforms import Transform
+from torchrl_etl.transforms.keys import SoleWriter, group_reset, group_shape, set_leaf
 
 __all__ = ["DirectionPrimer"]
 
 
-class DirectionPrimer(TensorDictPrimer):
+class DirectionPrimer(SoleWriter, TensorDictPrimer):
     """Draws a unit vector at the start of each episode and keeps it until the end.
 
     Works on single, serial, parallel and vectorized envs without being told the batch size. At a
@@ -130,19 +121,6 @@ class DirectionPrimer(TensorDictPrimer):
             leaf = leaf.to(observation_spec.device)
         set_leaf(observation_spec, key, leaf, self.parent)
         return observation_spec
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        refuse_shared_keys(self, output_spec, self.out_keys)
-        return super().transform_output_spec(output_spec)
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        super().set_container(container)
-        if self.parent is not None:
-            try:
-                refuse_shared_keys(self, self.parent.output_spec, self.out_keys)
-            except ValueError:
-                self.reset_parent()
-                raise
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.get(self.out_keys[0], None) is None:

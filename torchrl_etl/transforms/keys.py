@@ -11,7 +11,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, TensorDictPrimer, Transform
 
-__all__ = ["group_reset", "group_shape", "private_key", "refuse_shared_keys", "set_leaf"]
+__all__ = ["SoleWriter", "group_reset", "group_shape", "private_key", "set_leaf"]
 
 
 def group_shape(env: EnvBase, key: NestedKey) -> torch.Size:
@@ -65,6 +65,23 @@ def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
     *group, name = (key,) if isinstance(key, str) else key
     owner = owner if isinstance(owner, str) else owner[-1]
     return unravel_key((*group, f"_{owner}_{name}"))
+
+
+class SoleWriter(Transform):
+    """A transform that is refused where something else writes its out-keys."""
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        refuse_shared_keys(self, output_spec, self.out_keys)
+        return super().transform_output_spec(output_spec)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        if self.parent is not None:
+            try:
+                refuse_shared_keys(self, self.parent.output_spec, self.out_keys)
+            except ValueError:
+                self.reset_parent()
+                raise
 
 
 def refuse_shared_keys(

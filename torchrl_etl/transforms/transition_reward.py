@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,22 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform
 
-from torchrl_etl.transforms.keys import (
-    group_reset,
-    private_key,
-    refuse_shared_keys,
-    set_leaf,
-)
-
-if TYPE_CHECKING:
-    from torchrl.envs import EnvBase
+from torchrl_etl.transforms.keys import SoleWriter, group_reset, private_key, set_leaf
 
 __all__ = ["TransitionReward", "evaluate"]
 
 
-class TransitionReward(Transform):
+class TransitionReward(SoleWriter):
     """Writes rewards below ``"next"`` that depend on both ends of a step.
 
     The first in-key is the observation that is compared. In an environment, transforms behind this
@@ -116,19 +106,6 @@ class TransitionReward(Transform):
 
     def _keep(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self._copy_key, self._read(tensordict, self.in_keys[0]).clone())
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        super().set_container(container)
-        if self.parent is not None:
-            try:
-                refuse_shared_keys(self, self.parent.output_spec, self.out_keys)
-            except ValueError:
-                self.reset_parent()
-                raise
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        refuse_shared_keys(self, output_spec, self.out_keys)
-        return super().transform_output_spec(output_spec)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         leaf = self._leaf(self.in_keys[0]).clone()
