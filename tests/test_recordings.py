@@ -73,7 +73,10 @@ def test_arrays_of_numpy_are_read_in_every_form(tmp_path):
         ('a,b\n1,2\n"3,4\n5,6\n', "Line 3 of .* has quotation marks that do not pair up"),
         ('a,b\n1,2\n3,"4\n' + "5,6\n" * 50_000, "Line 3 of .*emg.csv .*larger than field limit"),
         ("a,b\n1,2\n1,3\n", "'a' in .* has the same value in every row; .*leave_out=\\[a\\]"),
+        ("a (mV);b, left\n1;2\n1;3\n", "'a \\(mV\\)' .*with \"leave_out=\\['a \\(mV\\)'\\]\""),
         ("a,a\n1,2\n2,3\n", "2 columns 'a'"),
+        (",a\n1,2\n2,3\n", "Column 1 of .* has no name"),
+        ("trial,a\nx,2\n,3\n", "does not say which trial line 3 is of"),
         ("1,2\n3,4\n", "names no columns"),
         ("", "names no columns"),
         ("a,b\n1,2\n", "1 row"),
@@ -94,6 +97,7 @@ def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
     np.savez(tmp_path / "ragged.npz", a=np.arange(3), b=np.arange(4))
     np.savez(tmp_path / "names.npz", a=emg(4), names=np.array(["x"]))
     np.savez(tmp_path / "gap.npz", a=np.array([1.0, np.nan]), b=np.arange(2))
+    np.savez(tmp_path / "trial.npz", a=np.arange(2), trial=np.array([1.0, np.nan]))
     np.savez(tmp_path / "text.npz", a=np.array(["x", "y"]), b=np.arange(2))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "two.npz").read_bytes()[:200])
     (tmp_path / "latin.csv").write_bytes("a,\xe4\n1,2\n".encode("latin-1"))
@@ -105,6 +109,7 @@ def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
         "ragged.npz": "3 and 4 rows",
         "names.npz": "1 names for the 6 columns",
         "gap.npz": "'a' in .* has no value in row 1;",
+        "trial.npz": "which trial row 1 is of",
         "text.npz": "'a' in .* of type",
         "cut.npz": "does not hold arrays of numbers",
         "latin.csv": "not a text in UTF-8",

@@ -58,8 +58,8 @@ def read_recording(
     Raises:
         OSError: if the file cannot be read.
         ValueError: if it is of another kind, has rows of different lengths, missing values, decimal
-            commas, a muscle that never varies, or names twice. Rows are told by the line of a
-            ``.csv`` file, by their index from 0 in an array.
+            commas, a muscle that never varies, or names twice or not at all. Rows are told by the
+            line of a ``.csv`` file, by their index from 0 in an array.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -87,6 +87,13 @@ def read_recording(
             raise ValueError(f"{path} has no column {name!r}; it has {', '.join(named)}.")
     trial = trial or "trial"
     trials = next((np.asarray(c).astype(str) for name, c in columns if name == trial), None)
+    if trials is not None:
+        for row, name in enumerate(trials):
+            if name.strip().lower() in _MISSING:
+                raise ValueError(
+                    f"{path} does not say which {trial} {_place(lines, row)} is of; fill it in, or "
+                    "leave the row out."
+                )
     columns = [(name, c) for name, c in columns if name != trial and name not in leave_out]
     if not columns:
         raise ValueError(f"{path} has no column that is a muscle; pass a file that has some.")
@@ -107,11 +114,16 @@ def _read_csv(path: Path) -> tuple[Columns, Lines]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not a text in UTF-8 ({error.reason}); save it so.") from error
     head = lines[0] if lines else ""
-    rows = _rows(path, lines, max(",;\t", key=head.count))
+    rows = _rows(path, lines, max("\t;,", key=head.count))
     names = [name.strip() for name in rows[0][1]] if rows else []
     if not any(names) or all(map(_is_number, names)):
         raise ValueError(
             f"The first line of {path} names no columns; write the name of each muscle there."
+        )
+    if "" in names:
+        raise ValueError(
+            f"Column {names.index('') + 1} of {path} has no name in the first line; name it, or "
+            "leave it out of the file if it is empty or counts the rows."
         )
     rows = [(number, row) for number, row in rows[1:] if row]
     for number, row in rows:
@@ -212,12 +224,12 @@ def _numbers(path: Path, name: str, column: np.ndarray | list[str], lines: Lines
             raise ValueError(
                 f"{name!r} in {path} has {column[wrong]!r}, not a number, in "
                 f"{_place(lines, wrong)}; if it is not a muscle, leave it out with "
-                f"leave_out=[{name}]."
+                f"{_leave_out(name)}."
             )
     elif column.dtype.kind not in "fiub":
         raise ValueError(
             f"{name!r} in {path} is of type {column.dtype}, not real numbers; if it is not a "
-            f"muscle, leave it out with leave_out=[{name}]."
+            f"muscle, leave it out with {_leave_out(name)}."
         )
     return np.asarray(column, dtype=np.float64)
 
@@ -228,6 +240,14 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _leave_out(*names: str) -> str:
+    """The setting as a shell takes it: what is more than a word needs quotation marks."""
+    if all(re.fullmatch(r"\w+", name) for name in names):
+        return f"leave_out=[{','.join(names)}]"
+    listed = ",".join(f"'{name}'" for name in names)
+    return f'"leave_out=[{listed}]"'
 
 
 def _place(lines: Lines, row: int) -> str:
@@ -253,5 +273,5 @@ def _check(path: Path, muscles: Sequence[str], activity: np.ndarray, lines: Line
     if constant:
         raise ValueError(
             f"{constant[0]!r} in {path} has the same value in every row; leave it out with "
-            f"leave_out=[{','.join(constant)}]."
+            f"{_leave_out(*constant)}."
         )
