@@ -42,6 +42,7 @@ from torchrl_etl.io import as_json, write_atomically
 from torchrl_etl.training import (
     EpisodeRecorder,
     Evaluation,
+    check_device,
     check_video_size,
     evaluate_task,
     resumed_config,
@@ -57,6 +58,7 @@ def main(config: DictConfig) -> None:
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)
+        check_device(config.device)
         size = check_video_size(
             config.video_size, episodes=config.video_episodes, sides=1 + config.video_before
         )

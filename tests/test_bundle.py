@@ -19,6 +19,7 @@ from torchrl_etl.synergies import (
     BundleError,
     BundleInfo,
     check_compatible,
+    copy_bundle,
     load_bundle,
     save_bundle,
 )
@@ -186,6 +187,8 @@ def test_saving_refuses_to_sweep_away_other_files(bundle):
     run = bundle.parent
     with pytest.raises(BundleError, match="holds 'synergies', and saving a bundle there would"):
         save(fitted_decoder(), run)
+    with pytest.raises(BundleError, match="holds 'synergies', and saving a bundle there would"):
+        copy_bundle(bundle, run)
     (run / "file").touch()
     with pytest.raises(BundleError, match="is a file"):
         save(fitted_decoder(), run / "file")

@@ -314,6 +314,7 @@ def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
         ("export.py", ["run=explored", "part=policy"], "part is 'policy'; choose one of"),
         ("evaluate.py", ["zoo=overactuted"], "nearest: overactuated"),
         ("evaluate.py", ["zoo=a", "run=b"], "a run and an entry are named"),
+        ("evaluate.py", ["zoo=overactuated", "device=gpu"], "device is 'gpu'; use cpu, cuda or"),
         ("etl_sac.py", ["synergies=zoo:nowhere", "env=overactuated"], "The zoo has no 'nowhere'"),
     ],
 )

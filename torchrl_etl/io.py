@@ -9,13 +9,14 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
 __all__ = [
     "as_json",
     "flush_folder",
+    "own_folder",
     "read_bytes",
     "read_json",
     "replace_folder",
@@ -62,6 +63,39 @@ def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str
     if not isinstance(content, kind):
         raise error(f"{path} holds no JSON {'array' if kind is list else 'object'}; {cure}.")
     return content
+
+
+def own_folder(
+    path: str | os.PathLike[str], names: Collection[str], what: str, error: type[ValueError]
+) -> Path:
+    """A folder to be replaced, which may hold files of these names and nothing else.
+
+    Args:
+        path (path-like): the folder, there already or not.
+        names (collection of str): what it may hold.
+        what (str): what will be saved there, in words.
+        error (type): what to raise.
+
+    Raises:
+        error: if there is a file, or a folder that holds anything else.
+
+    Examples:
+        >>> own_folder("recipes", ["card.json"], "an entry", ValueError)
+        Traceback (most recent call last):
+        ...
+        ValueError: ...recipes holds ..., and saving an entry there would remove it; choose ...
+    """
+    folder = Path(path).expanduser().resolve()
+    if folder.is_dir():
+        others = sorted({file.name for file in folder.iterdir()} - {*names})
+        held = f"holds {others[0]!r}" if others else ""
+    else:
+        held = "is a file" if folder.exists() else ""
+    if held:
+        raise error(
+            f"{folder} {held}, and saving {what} there would remove it; choose a folder of its own."
+        )
+    return folder
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:

@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from tensordict.utils import NestedKey
 
 from torchrl_etl.checks import not_finite
-from torchrl_etl.io import read_bytes, replace_folder, surviving_folder
+from torchrl_etl.io import own_folder, read_bytes, replace_folder, surviving_folder
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies.bundle_info import (
     COPY_AGAIN,
@@ -32,7 +32,6 @@ from torchrl_etl.synergies.bundle_info import (
     BundleInfo,
     default_kind,
     read_description,
-    some,
 )
 
 __all__ = ["BUNDLE_FILES", "bundle_files", "copy_bundle", "load_bundle", "save_bundle"]
@@ -123,7 +122,7 @@ def save_bundle(
         encoder=None if encoder is None else encoder.config,
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
-    folder = _own_folder(path)
+    folder = own_folder(path, BUNDLE_FILES, "a bundle", BundleError)
     replace_folder(folder, {_TENSORS: tensors, DESCRIPTION: description})
     return folder
 
@@ -215,7 +214,8 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         Path: the folder.
 
     Raises:
-        BundleError: if there is no bundle at ``source``, or it is damaged.
+        BundleError: if there is no bundle at ``source``, it is damaged, or ``target`` holds
+            anything but a bundle.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -229,7 +229,7 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
     """
     files, target = bundle_files(source), Path(target).resolve()
     if _find_folder(Path(source)) != target:
-        replace_folder(target, files)
+        replace_folder(own_folder(target, BUNDLE_FILES, "a bundle", BundleError), files)
     return target
 
 
@@ -268,21 +268,6 @@ def _plain(value: Any, where: str) -> Any:
         f"{where} is a {type(value).__name__}, which JSON cannot hold; pass numbers, strings, "
         "lists or dicts."
     )
-
-
-def _own_folder(path: str | os.PathLike[str]) -> Path:
-    """A folder for a bundle, which may hold an older one and nothing else."""
-    folder = Path(path).resolve()
-    if folder.exists() and (
-        not folder.is_dir()
-        or (others := {file.name for file in folder.iterdir()} - {*BUNDLE_FILES})
-    ):
-        held = f"holds {some(sorted(others))}" if folder.is_dir() else "is a file"
-        raise BundleError(
-            f"{str(folder)!r} {held}, and saving a bundle there would remove it; choose a folder "
-            "of its own, such as synergies/ in the run folder."
-        )
-    return folder
 
 
 def _find_folder(path: Path) -> Path:

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from torchrl_etl.training.config import validate
+from torchrl_etl.training.config import check_device, validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate, evaluate_task
 from torchrl_etl.training.loop import Interrupted
@@ -24,6 +24,7 @@ __all__ = [
     "Stage",
     "Sweep",
     "alone",
+    "check_device",
     "check_video_size",
     "evaluate",
     "evaluate_task",

@@ -28,6 +28,7 @@ __all__ = [
     "PRESETS",
     "RENAMED",
     "bfloat16_warning",
+    "check_device",
     "of_each_seed",
     "validate",
 ]
@@ -128,7 +129,7 @@ def validate(config: DictConfig) -> None:
     resolve_task(config.env, config.goal)
     _check_collector(config.collector)
     _check_loggers(config.log)
-    _check_device(config.device)
+    check_device(config.device)
 
 
 def _check_values(config: DictConfig) -> None:
@@ -224,10 +225,11 @@ def _check_loggers(names: object) -> None:
             raise ValueError(f"log names {name}, which is not installed; pip install {name}.")
 
 
-def _check_device(name: str) -> None:
+def check_device(name: str) -> None:
+    """Raise a ``ValueError`` unless a run can be on this device."""
     try:
         device = torch.device(name)
-    except RuntimeError:
+    except (RuntimeError, TypeError):
         device = torch.device("meta")
     if device.type not in ("cpu", "cuda"):
         raise ValueError(f"device is {name!r}; use cpu, cuda or cuda:0.")

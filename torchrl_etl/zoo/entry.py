@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env
-from torchrl_etl.io import read_bytes, replace_folder
+from torchrl_etl.io import own_folder, read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.own_code import check_imported
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
@@ -220,15 +220,7 @@ def save_entry(
         ZooError: if the folder holds anything but an entry, or the card does not describe the
             policy.
     """
-    folder = Path(folder).expanduser().resolve()
-    own = {CARD, WEIGHTS, *BUNDLE_FILES}
-    if folder.exists():
-        others = [path.name for path in folder.iterdir() if path.name not in own]
-        if others:
-            raise ZooError(
-                f"{folder} holds {others[0]!r}, and an entry there would remove it; choose a "
-                "folder of its own."
-            )
+    folder = own_folder(folder, (CARD, WEIGHTS, *BUNDLE_FILES), "an entry", ZooError)
     state = {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}
     weights = safetensors.torch.save(state)
     files = {} if bundle is None else bundle_files(bundle)
