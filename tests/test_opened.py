@@ -108,6 +108,7 @@ def test_an_entry_of_the_zoo_has_the_returns_of_its_card():
 
 def test_an_entry_s_synergies_are_shown_with_either_goal():
     with Session(open_zoo("myohand")) as session:
+        assert session.subject.name == "zoo=myohand"
         for goal in ("random", "fixed"):
             session.choose_goal(goal)
             session.step()

@@ -109,7 +109,7 @@ def open_zoo(name: str) -> Subject:
         'policy'
     """
     if zoo.synergies_alone(name):
-        return open_bundle(zoo.synergies(name))
+        return replace(open_bundle(zoo.synergies(name)), name=f"zoo={name}")
     card = zoo.read_card(name)
     policy, env = zoo.load(name)
     env.close()
