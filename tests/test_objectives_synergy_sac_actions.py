@@ -12,7 +12,7 @@ from tensordict import TensorDict, assert_close
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.func import functional_call
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from tests.loss_checks import SEED
@@ -119,6 +119,15 @@ def test_both_losses_go_through_the_decoder_as_it_is_now(loss, data) -> None:
         seen.append((actor.item(), qvalue.item()))
         move(loss.decoder_network_params)
     assert seen[0][0] != seen[1][0] and seen[0][1] != seen[1][1]
+
+
+def test_the_entropy_is_that_of_the_counted_coefficients_alone(data) -> None:
+    loss = make_loss(residual=0.5, counted=SYNERGIES)
+    distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
+    loc, scale = (part[..., :SYNERGIES] for part in (distribution.loc, distribution.scale))
+    synergy, log_prob = seeded(loss._sample, data)
+    wanted = TanhNormal(loc, scale, low=-1, high=1).log_prob(synergy[..., :SYNERGIES])
+    torch.testing.assert_close(log_prob, wanted)
 
 
 def test_a_replayed_transition_is_valued_at_its_executed_action(loss, data) -> None:

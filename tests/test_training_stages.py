@@ -210,14 +210,15 @@ def test_decoder_learns_only_in_the_modes_that_say_so(fine_tuning, learns):
     stage.close()
 
 
-def test_the_entropy_target_leaves_a_residual_of_fixed_noise_to_itself():
+def test_the_entropy_leaves_a_residual_of_fixed_noise_out():
     log = math.log(2 * math.pi * math.e) / 2  # of a standard Gaussian
     quiet = "learn.decoder.residual_std=0.05"
-    for std, coefficients in (("0.4", 2 * (log + math.log(0.4))), ("null", -2.0)):
+    for std, wanted in (("0.4", 2 * (log + math.log(0.4))), ("null", -2.0)):
         decoder = SynergyDecoder(2, 16, hidden=(32, 32), residual=1.0)
         stage = learn_stage(decoder, quiet, f"learn.sac.action_std={std}")
-        wanted = coefficients + 16 * (log + math.log(0.05))
-        assert stage.learner.objective.sac.target_entropy.item() == pytest.approx(wanted, rel=1e-5)
+        sac = stage.learner.objective.sac
+        assert sac.target_entropy.item() == pytest.approx(wanted, rel=1e-5)
+    assert sac.counted == 2
     batch = stage.collect()
     assert (batch["scale"][:, 2:] == 0.05).all() and (batch["scale"][:, :2] != 0.05).all()
 

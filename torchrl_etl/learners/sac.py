@@ -56,6 +56,8 @@ class SACLearner:
         ema_decay (float): decay of the EMA of the actor that is evaluated and saved. Default: 0.
         alpha_init (float): initial temperature. Default: 1.
         target_entropy (float or "auto"): see :func:`entropy_target`. Default: ``"auto"``.
+        counted (int, optional): entropy is that of so many leading entries of what the actor
+            emits. Default: of the action.
         num_critics (int): the smallest of whose values counts. Default: 2.
         loss_function (str): error of scalar critics. Default: ``"l2"``.
         return_bound (float, optional): rewards are scaled so that returns stay within it.
@@ -101,6 +103,7 @@ class SACLearner:
         ema_decay: float = 0.0,
         alpha_init: float = 1.0,
         target_entropy: float | Literal["auto"] = "auto",
+        counted: int | None = None,
         num_critics: int = 2,
         loss_function: str = "l2",
         return_bound: float | None = None,
@@ -116,7 +119,7 @@ class SACLearner:
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
         self.on_frames, self.on_restart = on_frames, on_restart
         decoded = {"action_spec": action_spec, "decoder": decoder, "train_decoder": train_decoder}
-        entropy = {"target_entropy": target_entropy, "alpha_init": alpha_init}
+        entropy = {"target_entropy": target_entropy, "counted": counted, "alpha_init": alpha_init}
         critics = {"num_critics": num_critics, "bins": bins, "loss_function": loss_function}
         sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
         scale = make_return_scale(gamma, return_bound)

@@ -280,7 +280,11 @@ class ETL(Method):
             decoder=decoder,
             make_actor=partial(make_actor, **self._quiet),
             entropy=self._entropy_target,
-            more=lambda actor: {"train_decoder": mode == "critic", "terms": [term]},
+            more=lambda actor: {
+                "train_decoder": mode == "critic",
+                "terms": [term],
+                "counted": self._loud(decoder.synergy_dim),
+            },
         )
         room = self.context.config.explore.frames if self.prefills else 0
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)
@@ -294,14 +298,15 @@ class ETL(Method):
         std = self.context.config.learn.decoder.residual_std
         return {} if std is None else {"quiet": self.context.spec.action_dim, "quiet_std": std}
 
+    def _loud(self, emitted: int) -> int | None:
+        """How many of the entries that the actor emits have noise of its choice, if not all."""
+        return emitted - self._quiet["quiet"] if self._quiet else None
+
     def _entropy_target(self, emitted: Bounded, std: float | None) -> float | Literal["auto"]:
-        """The target of what the actor emits; of a residual with fixed noise, what it has."""
-        if not self._quiet:
-            return entropy_target(emitted, std)
-        loud = emitted.shape[-1] - self._quiet["quiet"]
-        wanted = entropy_target(emitted[:loud], std)
-        fixed = entropy_target(emitted[loud:], self._quiet["quiet_std"])
-        return (-loud if wanted == "auto" else wanted) + fixed
+        """The target of what the actor emits, without a residual of fixed noise."""
+        loud = self._loud(emitted.shape[-1])
+        target = entropy_target(emitted[:loud], std)
+        return -float(loud) if target == "auto" and loud is not None else target
 
     def begin(self, stage: Stage) -> None:
         if self.prefills:

@@ -56,6 +56,8 @@ class LeanSACLoss(SACLoss):
             categorical critics always minimize the cross entropy. ``"l2"`` is the square itself,
             summed over critics; Stable-Baselines3 takes half of it. Default: ``"l2"``, where
             TorchRL has ``"smooth_l1"``: only the square makes the critic the *mean* return.
+        counted (int, optional): entropy is that of so many leading entries of a tanh-Gaussian
+            sample, where the noise of the others is none of the actor's choice. Default: of all.
         **kwargs: see :class:`torchrl.objectives.SACLoss`.
 
     Keys:
@@ -100,6 +102,7 @@ class LeanSACLoss(SACLoss):
         *,
         support: Tensor | None = None,
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
+        counted: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_parts("actor_network", actor_network, ProbabilisticTensorDictSequential)
@@ -122,6 +125,7 @@ class LeanSACLoss(SACLoss):
             _check_support(support)
             support = support.detach().clone()
         self.register_buffer("support", support)
+        self.counted = counted
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """See :meth:`torchrl.objectives.common.LossModule.set_keys`.
@@ -144,7 +148,7 @@ class LeanSACLoss(SACLoss):
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            return drawn(self.actor_network.get_dist(observed))
+            return drawn(self.actor_network.get_dist(observed), counted=self.counted)
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """What the critics read where the actor's ``action`` is taken."""
@@ -242,8 +246,12 @@ def _check_support(support: Tensor) -> None:
         )
 
 
-def drawn(distribution: Distribution, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+def drawn(
+    distribution: Distribution, sample_shape: Sequence[int] = (), counted: int | None = None
+) -> tuple[Tensor, Tensor]:
     """Reparametrized samples [S, *, n] with their log-probabilities [S, *].
+
+    Of a tanh-Gaussian, those of the ``counted`` leading entries.
 
     ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses.
     """
@@ -254,8 +262,8 @@ def drawn(distribution: Distribution, sample_shape: Sequence[int] = ()) -> tuple
     transform = distribution.transforms[0]
     action = transform(preimage)
     slope = transform.log_abs_det_jacobian(preimage, action)
-    log_prob = distribution.base_dist.log_prob(preimage)
-    return action, log_prob - slope.reshape(*log_prob.shape, -1).sum(-1)
+    each = distribution.base_dist.base_dist.log_prob(preimage) - slope
+    return action, each[..., :counted].sum(-1)
 
 
 def value_key(critic: TensorDictModule, name: NestedKey) -> NestedKey:

@@ -31,7 +31,9 @@ class SynergySACLoss(LeanSACLoss):
     Entropy is that of the coefficients and of the action given them: a decoder with a residual
     says by its ``log_slope`` how far the action moves with it
     (:meth:`~torchrl_etl.modules.SynergyDecoder.log_slope`). Without this, noise that the bounds of
-    the action swallow would count.
+    the action swallow would count. Where a residual has noise of a fixed size, ``counted``
+    coefficients alone have an entropy that is the policy's choice, and theirs is what counts: in
+    units of the action the rest could only change it by keeping muscles off their bounds.
 
     Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL, without a state-value network.
 
@@ -157,7 +159,7 @@ class SynergySACLoss(LeanSACLoss):
 
     def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         synergy, log_prob = super()._sample(tensordict)
-        if not hasattr(self.decoder_network, "log_slope"):
+        if self.counted is not None or not hasattr(self.decoder_network, "log_slope"):
             return synergy, log_prob
         params = self.decoder_network_params
         params = params if self.train_decoder else params.detach()
