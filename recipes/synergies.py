@@ -48,6 +48,8 @@ HEADER = ("synergies", "fitted", "held out", "worst fold", "best fold")
 def main(config: DictConfig) -> None:
     with one_sentence(ValueError, OSError):
         kind, options = kind_and_options(config)
+        folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
+        check_folder(folder)
         recording = load(config)
         numbers = numbers_of_synergies(config.num, len(recording.muscles))
         trials = recording.trials
@@ -72,7 +74,6 @@ def main(config: DictConfig) -> None:
             )
             print(f"{number:>10}  " + "  ".join(f"{value:>10.3f}" for value in found[number]))
         chosen = enough_synergies(found, config.vaf)
-        folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
         leave(folder, recording, models[chosen], found, config)
     enough = found[chosen].held_out >= config.vaf
     print(
@@ -102,6 +103,13 @@ def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
     if kind in ("gmvae", "vae"):
         options["updates"] = config.updates
     return kind, options
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that could not be made; fitting takes minutes."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ValueError(f"{there} is a file, so out={folder} can be no folder; choose another.")
 
 
 def load(config: DictConfig) -> Recording:
@@ -190,5 +198,5 @@ if __name__ == "__main__":
                 check_choice("kind", kind := argument.removeprefix("kind="), list(SYNERGY_MODELS))
                 arguments[i] = f"synergies={kind}"
     sys.argv[1:] = quote_paths(arguments, "data", "out")
-    check_overrides(CONF / "recording.yaml", sys.argv[1:], __doc__)
+    check_overrides(CONF / "recording.yaml", sys.argv[1:], __doc__, short=["kind"])
     main()

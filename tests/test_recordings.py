@@ -146,8 +146,19 @@ def test_held_out_variance_is_that_of_models_that_have_not_seen_the_rows():
     # Fitted: the mean itself. Held out: 5 for 0 and 2, 1 for 4 and 6: 25 + 9 + 9 + 25 of 20.
     assert found.fitted == 0.0
     assert found.held_out == pytest.approx(1 - 68 / 20)
-    assert found.lowest == found.highest == pytest.approx(1 - 34 / 2)
+    assert found.lowest == found.highest == pytest.approx(1 - 34 / 10)
     assert model.mean.item() == 3.0
+
+
+def test_a_fold_of_one_row_has_a_variance_to_account_for():
+    rows = np.array([[0.0], [3.0], [6.0], [7.0]])
+    found, _ = cross_validate(Mean, rows, folds=4)
+    # About the mean of all, 4: 16, 1, 4 and 9. Told: 16/3, 13/3, 10/3 and 3, of the other three.
+    assert found.lowest == pytest.approx(1 - (16 / 9))
+    assert found.highest == pytest.approx(1 - (16 / 9))
+    row = emg(4, sources=1)
+    found, _ = cross_validate(lambda rows: fit_synergies(rows, "pca", 1, low=0.0), row, folds=4)
+    assert 0.0 < found.lowest < found.highest < 1.0
 
 
 @pytest.mark.parametrize("kind", ["nmf", "pca"])
@@ -198,6 +209,9 @@ def test_the_command_leaves_a_table_a_bundle_and_pictures(tmp_path, monkeypatch,
         (["data=null"], "no recording is named"),
         (["data=other.csv"], "no file"),
         (["normalise=true"], "did you mean normalize"),
+        (["knd=nmf"], "did you mean kind"),
+        (["out=emg.csv"], "emg.csv is a file, so out=emg.csv can be no folder"),
+        (["out=emg.csv/new"], "emg.csv is a file, so out=emg.csv/new can be no folder"),
     ],
 )
 def test_a_wrong_setting_of_the_command_is_one_sentence(

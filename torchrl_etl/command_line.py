@@ -40,7 +40,9 @@ OPENING_FAULTS = (ValueError, OSError, ImportError, SimulationError, gymnasium.e
 """What explains itself when a run, a bundle or an entry is opened with its simulators."""
 
 
-def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
+def check_overrides(
+    config: Path, arguments: list[str], usage: str, *, short: Sequence[str] = ()
+) -> None:
     """Answer ``--help``, and leave with the nearest key if an override names none that exists.
 
     Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing. A
@@ -51,6 +53,10 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
         config (path): the primary YAML file; folders beside it are groups.
         arguments (list of str): the command line without the program.
         usage (str): what the help begins with.
+
+    Keyword Args:
+        short (sequence of str): ways to write a setting that the recipe has translated already, to
+            be suggested like the rest.
     """
     text = config.read_text(encoding="utf-8")
     if {"-h", "--help"} & set(arguments):
@@ -80,7 +86,7 @@ def check_overrides(config: Path, arguments: list[str], usage: str) -> None:
         if not separator and not argument.startswith("~"):
             sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
         if key not in known and key.split(".")[0] not in OPEN_SECTIONS:
-            near = difflib.get_close_matches(key, list(dict.fromkeys(known)), n=3)
+            near = difflib.get_close_matches(key, list(dict.fromkeys([*known, *short])), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             sys.exit(f"Error: there is no setting {key!r}; {hint}")
         with one_sentence(ValueError):

@@ -85,8 +85,9 @@ def cross_validate(
 ) -> tuple[CrossValidation, SynergyModel]:
     """Fit a model to all rows and, for each fold, to all rows but those of the fold.
 
-    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, with â of the model that was fitted without
-    the row and ā the mean of all rows; of one fold, over its rows about their own mean.
+    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, or those of one fold, with â of the model that
+    was fitted without the row and ā the mean of all rows. (A fold's own mean would leave one of a
+    single row no variance to account for.)
 
     Args:
         fit (callable): a model fitted to rows [N, n] in single precision.
@@ -121,7 +122,8 @@ def cross_validate(
         without = fit(rows[rest])
         with torch.no_grad():
             told[part] = without.reconstruct(rows[part])
-    of_parts = [variance_accounted_for(rows[part], told[part]) for part in parts]
+    mean = as_matrix(rows, "activity").mean(0)
+    of_parts = [variance_accounted_for(rows[part], told[part], mean=mean) for part in parts]
     held_out = variance_accounted_for(rows, told)
     return CrossValidation(fitted, held_out, min(of_parts), max(of_parts)), model
 

@@ -15,7 +15,10 @@ __all__ = ["nmf_vaf", "pca_vaf", "variance_accounted_for"]
 
 
 def variance_accounted_for(
-    actions: Tensor | ArrayLike, reconstruction: Tensor | ArrayLike
+    actions: Tensor | ArrayLike,
+    reconstruction: Tensor | ArrayLike,
+    *,
+    mean: Tensor | ArrayLike | None = None,
 ) -> float:
     """Variance accounted for: 1 − Σ‖a − â‖² / Σ‖a − ā‖², with ā the mean action.
 
@@ -26,6 +29,9 @@ def variance_accounted_for(
     Args:
         actions (Tensor or array): actions [*, n].
         reconstruction (Tensor or array): their reconstructions, of the same shape.
+
+    Keyword Args:
+        mean (Tensor or array, optional): ā [n], of more actions than these. Default: their own.
 
     Raises:
         ValueError: if the shapes differ, there are no actions, or a number is not finite.
@@ -42,7 +48,8 @@ def variance_accounted_for(
             "pass one reconstructed action per action."
         )
     missed = float(np.square(actions - reconstruction).sum())
-    total = float(np.square(actions - actions.mean(0)).sum())
+    center = actions.mean(0) if mean is None else as_array(mean)
+    total = float(np.square(actions - center).sum())
     # Rounding leaves a constant column a variance of some (1e-16)² relative to its size, and
     # float32 data a residual of (1e-7)².
     size = float(np.square(actions).sum())
