@@ -85,9 +85,9 @@ def cross_validate(
 ) -> tuple[CrossValidation, SynergyModel]:
     """Fit a model to all rows and, for each fold, to all rows but those of the fold.
 
-    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, or those of one fold, with â of the model that
-    was fitted without the row and ā the mean of all rows. (A fold's own mean would leave one of a
-    single row no variance to account for.)
+    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, or those of one fold, with â of the model
+    that was fitted without the row and ā the mean of all rows. (A fold's own mean would leave a
+    fold of one row no variance to account for.)
 
     Args:
         fit (callable): a model fitted to rows [N, n] in single precision.
