@@ -223,6 +223,27 @@ def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
         assert recipe.index("draw_without_display()") < recipe.index(importer)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo has no such back ends")
+@pytest.mark.parametrize(("backend", "package"), [("osmesa", "libosmesa6"), ("egl", "libegl1")])
+def test_a_back_end_that_is_not_installed_is_ignored_and_its_package_named(backend, package):
+    code = (
+        "import ctypes, os\n"
+        "real = ctypes.CDLL\n"
+        "def missing(name, *args, **kwargs):\n"
+        "    if str(name).startswith(('libEGL', 'libOSMesa')): raise OSError(name)\n"
+        "    return real(name, *args, **kwargs)\n"
+        "ctypes.CDLL = missing\n"
+        "import torchrl_etl\n"
+        "ctypes.CDLL = real\n"
+        "assert 'MUJOCO_GL' not in os.environ\n"
+        "import mujoco\n"
+    )
+    environ = os.environ | {"MUJOCO_GL": backend}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environ)
+    assert done.returncode == 0, done.stderr
+    assert f"MUJOCO_GL={backend} is ignored" in done.stderr and package in done.stderr
+
+
 def test_a_tilde_is_the_home_folder(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     given = ["run_dir=~/runs", "resume='~/a b'", "seed=~/x"]

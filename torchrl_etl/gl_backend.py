@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
+import warnings
 
-__all__ = ["draw_without_display"]
+__all__ = ["draw_without_display", "ignore_missing_library"]
 
 _TRY = "import mujoco; mujoco.GLContext(16, 16).make_current()"
+_LIBRARIES = {"egl": ("libEGL", "libegl1"), "osmesa": ("libOSMesa", "libosmesa6")}
+
+
+def ignore_missing_library() -> None:
+    """Warn and forget a ``MUJOCO_GL`` whose library is missing, naming the package to install.
+
+    MuJoCo opens that library when it is imported, and so nothing would run, whether it draws or
+    not.
+    """
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if sys.platform != "linux" or backend not in _LIBRARIES:
+        return
+    library, package = _LIBRARIES[backend]
+    if not any(map(_opens, (f"{library}.so", *(f"{library}.so.{i}" for i in range(10))))):
+        warnings.warn(
+            f"MUJOCO_GL={backend} is ignored, since {library} is not installed (Debian: apt-get "
+            f"install {package}).",
+            stacklevel=2,
+        )
+        del os.environ["MUJOCO_GL"]
 
 
 def draw_without_display() -> None:
@@ -28,3 +50,11 @@ def draw_without_display() -> None:
         if tried.returncode == 0:
             os.environ["MUJOCO_GL"] = backend
             return
+
+
+def _opens(file: str) -> bool:
+    try:
+        ctypes.CDLL(file)
+    except OSError:
+        return False
+    return True
