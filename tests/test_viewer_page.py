@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -54,6 +55,23 @@ def test_a_slider_moves_a_body_that_is_drawn(name):
         assert page.body._parts and np.isfinite(placed).all()
         assert (page.body._placed != placed).any()
         assert shades and any((shapes[key].batched_colors != shades[key]).any() for key in shades)
+    finally:
+        page.close()
+
+
+def test_what_moves_a_followed_body_stays_where_the_body_is_drawn():
+    page = open_page("humanoid-stand")
+    try:
+        body, data = page.body, page.session.data
+        joints = body._shapes["joints"]
+        before = joints.batched_positions.copy()
+        data.qpos[:2] += 1.0, -2.0
+        mujoco.mj_forward(page.session.model, data)
+        body.draw()
+        np.testing.assert_allclose(body._world.position[:2], -data.body("torso").xpos[:2])
+        # The browser moves the world a picture before it moves the joints.
+        assert not joints.name.startswith("/world")
+        np.testing.assert_allclose(joints.batched_positions, before, atol=1e-5)
     finally:
         page.close()
 

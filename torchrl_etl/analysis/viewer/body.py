@@ -66,6 +66,7 @@ class Body:
         self._shapes: dict[str, Any] = {}
         self._room: dict[str, int] = {}
         self._followed = self._root() if follow else None
+        self._ahead = np.zeros(3)
         self._place_camera()
         self.draw()
 
@@ -73,8 +74,8 @@ class Body:
         """Show the state that the data now has."""
         with self._server.atomic():
             if self._followed is not None:
-                ahead = -self._data.xpos[self._followed]
-                self._world.position = (ahead[0], ahead[1], 0.0)
+                self._ahead[:2] = -self._data.xpos[self._followed][:2]
+                self._world.position = self._ahead
             self._place(self._parts, self._data.xpos, self._data.xmat, 0)
             self._place(self._sites, self._data.site_xpos, self._data.site_xmat, len(self._parts))
             self._draw_muscles()
@@ -167,7 +168,11 @@ class Body:
         scales: np.ndarray,
         shades: np.ndarray,
     ) -> None:
-        """Many copies of one shape, [N, *] each."""
+        """Many copies of one shape, [N, *] each.
+
+        The browser draws them one picture later than what has a pose, so that a tendon in a world
+        that moves would be left behind: they are put beside that world, where it has moved to.
+        """
         count, room = len(positions), self._room.get(name, 0)
         if not count:
             return
@@ -176,12 +181,13 @@ class Body:
             if name in self._shapes:
                 self._shapes.pop(name).remove()
         padding = ((0, room - count), (0, 0))
+        positions = positions + self._ahead
         positions, scales = (np.pad(a, padding).astype(np.float32) for a in (positions, scales))
         wxyzs = np.pad(wxyzs, padding, constant_values=0.5).astype(np.float32)
         shades = np.pad(shades, padding)
         if (handle := self._shapes.get(name)) is None:
             self._shapes[name] = self._server.scene.add_batched_meshes_simple(
-                f"/world/{name}",
+                f"/{name}",
                 _SHAPES[name].vertices,
                 _SHAPES[name].faces,
                 batched_wxyzs=wxyzs,
