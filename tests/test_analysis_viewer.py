@@ -12,9 +12,10 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_etl.analysis.viewer import Session, Subject
+from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, seen
 from torchrl_etl.analysis.viewer.muscles import activations, colors, driven_muscles, paths
 from torchrl_etl.analysis.viewer.words import activation_grid, driven_list, status
-from torchrl_etl.envs import actuator_names, make_env, resolve_task
+from torchrl_etl.envs import actuator_names, make_env, mujoco_state, resolve_task
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training.evaluation import evaluate
 
@@ -270,3 +271,15 @@ def test_the_page_tells_return_and_whether_the_episode_counts_as_solved():
     assert "return <b>0.0</b>" in status(session) and "0 steps of 6 needed" in status(session)
     session.solved, session.solved_steps = True, 6
     assert session.success and "<b>solved</b>" in status(session)
+
+
+@pytest.mark.parametrize(
+    ("task", "under_a_skin"), [("dog-walk", 144), ("myoElbowPose1D6MRandom-v0", 0)]
+)
+def test_bones_are_drawn_in_place_of_a_skin(task, under_a_skin):
+    env = make_env(task)
+    model, _ = mujoco_state(env)
+    usual = model.geom_group < SHOWN_GROUPS
+    assert (seen(model) & ~usual).sum() == under_a_skin
+    assert (seen(model) | ~usual).all()
+    env.close()

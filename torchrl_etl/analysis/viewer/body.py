@@ -12,6 +12,7 @@ from torchrl_etl.analysis.viewer.framing import (
     moving_bodies,
     planes,
     scenery,
+    seen,
 )
 from torchrl_etl.analysis.viewer.muscles import activations, colors, paths
 from torchrl_etl.extras import extra
@@ -85,7 +86,7 @@ class Body:
         model, scene = self._model, self._server.scene
         flat = planes(model)
         opacity = _rgba(model, "geom")[:, 3]
-        shown = (model.geom_group < SHOWN_GROUPS) & (opacity > 0) & ~scenery(model)
+        shown = seen(model) & (opacity > 0) & ~scenery(model)
         for geom in np.flatnonzero(shown & flat):
             scene.add_grid(
                 f"/world/plane{geom}",
