@@ -45,7 +45,7 @@ def build_learner(
     make_actor: Callable[..., Actor] = make_actor,
     make_behavior: Callable[[Actor], TensorDictModuleBase] | None = None,
     wrap: Callable[[TensorDictModuleBase], TensorDictModuleBase] = lambda behavior: behavior,
-    entropy: Callable[[Bounded, float | None], float | Literal["auto"]] = entropy_target,
+    entropy: Callable[[Bounded, float | None], float] = entropy_target,
     more: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
 ) -> SACLearner:
     """Build the networks for an environment's sizes and a learner that owns them.

@@ -265,10 +265,10 @@ def from_observation(
     return TensorDictSequential(*before, actor, *after) if before or after else actor
 
 
-def entropy_target(action_spec: Bounded, action_std: float | None) -> float | Literal["auto"]:
+def entropy_target(action_spec: Bounded, action_std: float | None) -> float:
     """Entropy of a Gaussian with ``action_std`` per dimension, in units where the bounds are ±1.
 
-    ``None`` gives SAC's usual minus the number of dimensions ("auto").
+    ``None`` gives SAC's usual minus the number of dimensions.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -278,7 +278,7 @@ def entropy_target(action_spec: Bounded, action_std: float | None) -> float | Li
         1.452
     """
     if action_std is None:
-        return "auto"
+        return -float(action_spec.shape.numel())
     check_real("(0, inf)", action_std=action_std)
     half_range = (action_spec.space.high - action_spec.space.low) / 2
     return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())

@@ -100,8 +100,6 @@ class DynSyn(Method):
         def entropy(spec: Bounded, action_std: float | None) -> float:
             # The actor's log-probability counts one dimension a group.
             first = [groups.index(group) for group in sorted(set(groups))]
-            if action_std is None:
-                return -float(len(first))
             return entropy_target(spec[first], action_std)
 
         self.context.seed_everything("learn")

@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import safetensors.torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import Bounded
 
 from torchrl_etl import zoo
 from torchrl_etl.analysis import describe_synergies, direction_alignment
@@ -275,15 +274,17 @@ class ETL(Method):
         decoder = decoder.to(self.context.device).requires_grad_(mode != "frozen")
         with naming("learn.decoder"), renaming(weight="distillation_weight"):
             term = Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])
+        # A residual of fixed noise has no entropy of the policy's choice.
+        counted = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder,
             make_actor=partial(make_actor, **self._quiet),
-            entropy=self._entropy_target,
+            entropy=lambda emitted, std: entropy_target(emitted[:counted], std),
             more=lambda actor: {
                 "train_decoder": mode == "critic",
                 "terms": [term],
-                "counted": self._loud(decoder.synergy_dim),
+                "counted": counted,
             },
         )
         room = self.context.config.explore.frames if self.prefills else 0
@@ -297,16 +298,6 @@ class ETL(Method):
         """Arguments of the actor where the noise of the residual is fixed."""
         std = self.context.config.learn.decoder.residual_std
         return {} if std is None else {"quiet": self.context.spec.action_dim, "quiet_std": std}
-
-    def _loud(self, emitted: int) -> int | None:
-        """How many of the entries that the actor emits have noise of its choice, if not all."""
-        return emitted - self._quiet["quiet"] if self._quiet else None
-
-    def _entropy_target(self, emitted: Bounded, std: float | None) -> float | Literal["auto"]:
-        """The target of what the actor emits, without a residual of fixed noise."""
-        loud = self._loud(emitted.shape[-1])
-        target = entropy_target(emitted[:loud], std)
-        return -float(loud) if target == "auto" and loud is not None else target
 
     def begin(self, stage: Stage) -> None:
         if self.prefills:
