@@ -144,9 +144,11 @@ class Stage:
         self.transforms = nn.ModuleList(transforms)
         # What a transform makes of a batch may depend on the updates before it: a bonus does.
         self._at_once = 1 if transforms else AT_ONCE
-        several = n_steps > 1
-        self.multi_step = ContinuedMultiStep(learner.gamma, n_steps) if several else None
-        self._kept = [*TRANSITION, *keep, *(("steps_to_next_obs",) if several else ())]
+        self._kept = [*TRANSITION, *keep]
+        self.multi_step = None
+        if n_steps > 1:
+            self.multi_step = ContinuedMultiStep(learner.gamma, n_steps)
+            self._kept.append("steps_to_next_obs")
 
     @property
     def frames(self) -> int:
