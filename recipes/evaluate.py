@@ -58,7 +58,6 @@ def main(config: DictConfig) -> None:
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)
-        check_device(config.device)
         size = check_video_size(
             config.video_size, episodes=config.video_episodes, sides=1 + config.video_before
         )
@@ -118,6 +117,7 @@ def of_a_run(config: DictConfig) -> Trained:
 
 
 def of_the_zoo(config: DictConfig) -> Trained:
+    check_device(config.device)
     card = zoo.read_card(config.zoo)
     policy, env = zoo.load(config.zoo, device=config.device)
     before = partial(zoo.untrained, config.zoo, device=config.device)
