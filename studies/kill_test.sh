@@ -5,9 +5,10 @@
 #     sh studies/kill_test.sh [TASK [FRAMES]]      default: myoLegWalk 400000
 #     JOBS=2 SEEDS=[0,1,2] sh studies/kill_test.sh      two runs at a time, three seeds
 #
-# A thread a run, seeds 0 and 1, one after the other by default; rows go to docs/results/kill_test. Kill it at
-# any time and start it again, here or on another machine: finished runs stay (the table alone is
-# enough), others go on from their checkpoints, and an oracle is made when what it needs is there.
+# A thread a run, seeds 0 and 1, one after the other by default; rows go to docs/results/kill_test.
+# Kill it at any time and start it again, here or on another machine: finished runs stay (the table
+# alone is enough), others go on from their checkpoints, and an oracle is made when what it needs is
+# there.
 # It takes 1.5 to 2 hours a run on a free core with AVX2.
 set -e
 cd "$(dirname "$0")/.."
