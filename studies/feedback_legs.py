@@ -1,0 +1,69 @@
+"""Leg Walk with muscles that answer joint angles: does feedback in time make synergies pay?
+
+``env=studies.feedback_legs:FeedbackLegWalk-v0``, from the project's root, is myoLegWalk whose
+excitations get, before every step, the synergies of ``synergies=body`` with the coefficients
+
+    Kp (q0 - q) - Kd q'
+
+of its 14 joints, clamped to [-1, 1]; q0 is the posture after a reset. A coefficient of a policy is
+then a shift of its joint's target angle, by 1 / Kp at most. ``+env_kwargs.kp=0 +env_kwargs.kd=0``
+is the task as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from torchrl_etl.envs import joint_torques, make_env, muscle_changes
+
+TASK = "myoLegWalk"
+ENV_ID = "FeedbackLegWalk-v0"
+
+
+class JointFeedback(gym.Wrapper):
+    """Adds Kp (q0 - q) - Kd q' to the coefficients of the body's synergies; bounds are [0, 1].
+
+    Args:
+        env (gym.Env): legs of MyoSuite, whose actions are excitations.
+
+    Keyword Args:
+        kp (float): coefficient per rad, at least 0.
+        kd (float): coefficient per rad/s, at least 0.
+    """
+
+    def __init__(self, env: gym.Env, *, kp: float, kd: float) -> None:
+        super().__init__(env)
+        self._kp, self._kd = kp, kd
+        body = make_env(TASK, seed=0)
+        body.reset()
+        torques = joint_torques(body)
+        body.close()
+        self._changes = muscle_changes(torques.matrix)
+        model = env.unwrapped.model
+        joints = [model.joint(name).id for name in torques.joints]
+        self._angles, self._speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+
+    def reset(self, **options: Any):
+        start = self.env.reset(**options)
+        self._posture = self.unwrapped.data.qpos[self._angles].copy()
+        return start
+
+    def step(self, action: np.ndarray):
+        data = self.unwrapped.data
+        stretch = self._posture - data.qpos[self._angles]
+        answer = self._kp * stretch - self._kd * data.qvel[self._speeds]
+        moved = action + answer.clip(-1, 1) @ self._changes
+        return self.env.step(moved.clip(0, 1).astype(np.float32))
+
+
+def make(*, kp: float = 1.0, kd: float = 0.1, **options: Any) -> gym.Env:
+    """Builds the task; options are those of myoLegWalk."""
+    make_env(TASK).close()  # MyoSuite's tasks are registered on demand
+    inner = gym.make(f"{TASK}-v0", disable_env_checker=True, **options).unwrapped
+    return JointFeedback(inner, kp=kp, kd=kd)
+
+
+gym.register(ENV_ID, entry_point=make, max_episode_steps=1000)
