@@ -1,0 +1,51 @@
+"""Returns of training episodes, by stretches of frames: less noisy than a fixed start's evaluation.
+
+    python studies/training_returns.py RUN [RUN ...] --out docs/results/kill_test/training.csv
+
+Where a task always starts alike, all evaluation episodes of a deterministic policy are the same
+one. Training acts with noise, in dozens of episodes between two evaluations: ``return`` is the mean
+of stage 2's log over the ``--stretch`` frames that end at ``frames``. Stretches that a run did not
+finish are left out. One CSV row a stretch; rows are appended.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from statistics import fmean
+
+from omegaconf import OmegaConf
+from rows import append
+
+from torchrl_etl.command_line import one_sentence
+from torchrl_etl.training.run_folder import RunFolder
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--stretch", type=int, default=25000, help="frames of a row")
+    parser.add_argument("--out", type=Path, required=True, help="CSV file to append to")
+    arguments = parser.parse_args()
+    for run in arguments.runs:
+        with one_sentence(OSError):
+            config = OmegaConf.load(run / "config.yaml")
+        folder = RunFolder(run, config)
+        start = folder.versions[-1]
+        row = {"task": config.env, "method": config.method.name, "seed": config.seed}
+        for frames, mean in stretches(*folder.series("learn/return"), arguments.stretch):
+            row |= {"frames": frames, "return": round(mean, 1)}
+            append(arguments.out, row | {key: start[key] for key in ("commit", "machine")})
+
+
+def stretches(frames: list[int], returns: list[float], length: int) -> list[tuple[int, float]]:
+    """The end of each whole stretch, and the mean of what was logged in it."""
+    ends = range(length, frames[-1] + 1, length) if frames else ()
+    pairs = list(zip(frames, returns, strict=True))
+    return [(end, fmean(r for f, r in pairs if end - length < f <= end)) for end in ends]
+
+
+if __name__ == "__main__":
+    main()
