@@ -9,7 +9,6 @@ Every evaluation is a row of results.csv. These are all settings, with their def
 
 from __future__ import annotations
 
-import os
 import shlex
 import signal
 import sys
@@ -24,9 +23,10 @@ from omegaconf import DictConfig, ListConfig
 from rich.live import Live
 from rich.table import Table
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
+from torchrl_etl.layout import available_cores
 from torchrl_etl.training import Run, Sweep, validate
 
 HERE = Path(__file__).parent
@@ -37,8 +37,8 @@ CONF = HERE / "conf"
 def main(config: DictConfig) -> None:
     with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
         runs = queue(config)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        sweep = Sweep(runs, Path(config.out), jobs=config.jobs or cores, attempts=config.attempts)
+        jobs = config.jobs or available_cores()
+        sweep = Sweep(runs, Path(config.out), jobs=jobs, attempts=config.attempts)
     display = Display(sweep)
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
@@ -68,9 +68,7 @@ def queue(config: DictConfig) -> list[Run]:
             raise ValueError(f"{name} is {value!r}; it must be a list, such as {name}=[a,b].")
     for method in config.methods:
         check_choice("methods", method, methods)
-    for name in ("frames", "attempts"):
-        if not isinstance(config[name], int) or config[name] < 1:
-            raise ValueError(f"{name} is {config[name]!r}; it must be a whole number above 0.")
+    check_integer(1, frames=config.frames, attempts=config.attempts)
     folder = Path(config.out).resolve()
     runs = []
     for seed, task, method in product(config.seeds, config.tasks, config.methods):

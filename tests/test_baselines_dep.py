@@ -189,11 +189,11 @@ def test_rows_of_the_controller_are_independent() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kappa": 0}, "positive"),
+        ({"kappa": 0}, "kappa is 0; it must be a number above 0"),
         ({"tau": 0}, "tau is 0; it must be a whole number, 1 or more"),
         ({"time_distance": 0}, "time_distance is 0; it must be a whole number, 1 or more"),
-        ({"bias_rate": -1}, "positive"),
-        ({"s4avg": 0.5}, "positive"),
+        ({"bias_rate": -1}, "bias_rate is -1; it must be a number 0 or more"),
+        ({"s4avg": 0.5}, r"s4avg is 0.5; it must be a number in \[1, inf\)"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, float], message: str) -> None:

@@ -181,8 +181,8 @@ def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
         ({"log_std_bounds": (0.0, -1.0)}, "low < high"),
         ({"log_std_init": 3.0}, "low <= log_std_init <= high"),
         ({"log_std_bounds": 2.0}, "pass a pair"),
-        ({"alpha": -1.0}, "neither may be negative"),
-        ({"std_reg": -1.0}, "neither may be negative"),
+        ({"alpha": -1.0}, "alpha is -1.0; it must be a number 0 or more"),
+        ({"std_reg": -1.0}, "std_reg is -1.0; it must be a number 0 or more"),
         ({"body": "conv"}, "choose one of mlp, residual"),
     ],
 )

@@ -61,7 +61,7 @@ def test_goal_that_contradicts_the_id_is_refused():
 
 
 def test_unknown_goal_is_refused():
-    with pytest.raises(ValueError, match="'fixed' or 'random', got 'moving'"):
+    with pytest.raises(ValueError, match="goal is 'moving'; choose one of fixed, random"):
         resolve_task("myoHandPose", "moving")
 
 

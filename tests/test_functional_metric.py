@@ -125,7 +125,7 @@ def test_expected_distance_sums_the_geometric_series() -> None:
 
 @pytest.mark.parametrize("gamma", [1.0, 1.5, -0.1])
 def test_expected_distance_refuses_a_divergent_series(gamma: float) -> None:
-    with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\)"):
+    with pytest.raises(ValueError, match=r"gamma is .*; it must be a number in \[0, 1\)"):
         F.expected_distance(1.0, gamma)
 
 
@@ -174,7 +174,7 @@ def test_literal_minimum_contracts_and_hinge_minimum_expands(weight: float) -> N
 
 
 def test_unknown_form_is_refused() -> None:
-    with pytest.raises(ValueError, match="'hinge' or 'literal', got 'paper'"):
+    with pytest.raises(ValueError, match="form is 'paper'; choose one of hinge, literal"):
         one = torch.ones(1)
         F.discriminability(one, one, one, one, 0.1, form="paper")  # type: ignore[arg-type]
 

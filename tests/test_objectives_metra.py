@@ -174,8 +174,8 @@ def test_lambda_is_part_of_the_state_and_starts_again_on_reset() -> None:
     ("options", "message"),
     [
         ({"norm": "max"}, "norm is 'max'; choose one of sum, mean"),
-        ({"epsilon": 0.0}, "epsilon is 0.0; it must be positive"),
-        ({"lambda_init": -1.0}, "lambda_init is -1.0; it must be positive"),
+        ({"epsilon": 0.0}, "epsilon is 0.0; it must be a number above 0"),
+        ({"lambda_init": -1.0}, "lambda_init is -1.0; it must be a number above 0"),
     ],
 )
 def test_wrong_options_are_refused_at_construction(options: dict[str, Any], message: str) -> None:

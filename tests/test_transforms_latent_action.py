@@ -70,7 +70,7 @@ def test_a_module_of_another_width_is_refused_at_attachment(place):
 
 
 def test_a_module_without_keys_or_with_two_inputs_is_refused():
-    with pytest.raises(TypeError, match="Linear without keys; wrap it"):
+    with pytest.raises(TypeError, match="Linear without in_keys and out_keys; wrap it"):
         LatentAction(nn.Linear(2, 5), SPEC)
     with pytest.raises(ValueError, match=r"reads \['a', 'b'\]"):
         LatentAction(TensorDictModule(torch.add, ["a", "b"], ["action"]), SPEC)

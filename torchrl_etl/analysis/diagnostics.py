@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchrl_etl.analysis.arrays import as_array, as_matrix
+from torchrl_etl.checks import check_integer
 
 if TYPE_CHECKING:
     from torchrl_etl.modules import SynergyDecoder
@@ -50,8 +51,7 @@ def control_authority(
         >>> authority.shape, bool((authority > 0).all() and (authority < 1).all())
         (torch.Size([39]), True)
     """
-    if num_samples < 2:
-        raise ValueError(f"num_samples is {num_samples}; percentiles need at least 2, say 1024.")
+    check_integer(2, num_samples=num_samples)
     if generator is None:
         generator = torch.Generator().manual_seed(0)
     synergies = torch.rand(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.extras import extra
 
 __all__ = ["Interval", "interval", "success_interval"]
@@ -117,5 +118,4 @@ def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.
 def _check(count: int, confidence: float) -> None:
     if count == 0:
         raise ValueError("There are no values to average; pass at least one.")
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence is {confidence}; it must lie between 0 and 1, such as 0.95.")
+    check_real("(0, 1)", confidence=confidence)

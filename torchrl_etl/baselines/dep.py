@@ -89,11 +89,9 @@ class DEPController:
     ) -> None:
         check_integer(1, num_muscles=num_muscles, tau=tau, time_distance=time_distance)
         check_choice("normalize", normalize, ("rows", "columns"))
-        if kappa <= 0 or bias_rate < 0 or s4avg < 1:
-            raise ValueError(
-                f"kappa is {kappa}, bias_rate {bias_rate} and s4avg {s4avg}; they must be "
-                "positive, not negative, and at least 1."
-            )
+        check_real("(0, inf)", kappa=kappa)
+        check_real("[0, inf)", bias_rate=bias_rate)
+        check_real("[1, inf)", s4avg=s4avg)
         self.kappa, self.tau, self.bias_rate = kappa, tau, bias_rate
         self.time_distance, self.s4avg, self.normalize = time_distance, s4avg, normalize
         nothing = torch.zeros(rows, num_muscles, device=device, dtype=dtype)

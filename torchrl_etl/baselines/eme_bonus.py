@@ -12,7 +12,9 @@ from torch import Tensor
 
 from torchrl_etl import functional
 from torchrl_etl.baselines.reward_ensemble import diversity_scale
+from torchrl_etl.checks import check_real
 from torchrl_etl.modules.running_deviation import RunningDeviation
+from torchrl_etl.transforms.keys import check_network
 from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
 
 __all__ = ["EMEBonus"]
@@ -100,18 +102,16 @@ class EMEBonus(TransitionReward):
         out_keys: Sequence[NestedKey] = ("intrinsic_reward", "total_reward"),
         reward_key: NestedKey = "reward",
     ) -> None:
-        _check_keys("encoder", encoder, reads=("observation",))
-        _check_keys("ensemble", ensemble, reads=("observation", "action"))
+        check_network("encoder", encoder, ["observation"], "one embedding")
+        check_network("ensemble", ensemble, ["observation", "action"], "predictions")
         for name, keys, content in (
             ("in_keys", in_keys, "the observation and the action"),
             ("out_keys", out_keys, "the bonus and the total reward"),
         ):
             if isinstance(keys, str) or len(keys) != 2:
                 raise ValueError(f"{name} is {keys!r}; pass a pair of keys, {content}.")
-        if max_scale < 1.0:
-            raise ValueError(f"max_scale is {max_scale}; the scale is never below 1.")
-        if weight < 0.0:
-            raise ValueError(f"weight is {weight}; it must not be negative.")
+        check_real("[1, inf)", max_scale=max_scale)
+        check_real("[0, inf)", weight=weight)
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
         # In a tuple they are no submodules: as such they would follow the env's device, be put in
         # eval mode under the learner's feet, and be saved twice.
@@ -161,16 +161,3 @@ class EMEBonus(TransitionReward):
         rewarded = self.reward_deviation.mean.square() + self.reward_deviation.variance > 0
         unit = torch.where(rewarded, self.reward_deviation.divisor, 1.0)
         return unit * bonus / self.deviation.divisor
-
-
-def _check_keys(name: str, module: TensorDictModuleBase, reads: Sequence[str]) -> None:
-    if not (hasattr(module, "in_keys") and hasattr(module, "out_keys")):
-        raise TypeError(
-            f"The {name} is a {type(module).__name__} without in_keys and out_keys; wrap it in a "
-            "tensordict.nn.TensorDictModule."
-        )
-    if len(module.in_keys) != len(reads) or len(module.out_keys) != 1:
-        raise ValueError(
-            f"The {name} reads {list(module.in_keys)} and writes {list(module.out_keys)}; it must "
-            f"read {' and '.join(reads)}, and write one key."
-        )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from tensordict.utils import NestedKey
@@ -14,8 +13,10 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
+from torchrl_etl.checks import check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers
+from torchrl_etl.modules.clamp import Clamp
 
 __all__ = [
     "LatticeNetwork",
@@ -131,27 +132,6 @@ def lattice_scale_tril(weight: Tensor, latent_variance: Tensor, action_variance:
     return torch.linalg.cholesky(covariance + torch.diag_embed(extra))
 
 
-class _Within(torch.autograd.Function):
-    """Bounds whose gradient still passes where it leads back inside."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(value: Tensor, low: float, high: float) -> Tensor:
-        return value.clamp(low, high)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, float, float], output: Tensor) -> None:
-        value, *ctx.bounds = inputs
-        ctx.save_for_backward(value)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (value,), (low, high) = ctx.saved_tensors, ctx.bounds
-        outward = ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
-        return gradient.masked_fill(outward, 0), None, None
-
-
 class _Spread(nn.Module):
     """σ of Lattice: one linear head on the features x gives log σ_x [*, H] and log σ_a [*, n]."""
 
@@ -168,7 +148,7 @@ class _Spread(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Variances v_x [*, H] and v_a [*, n]."""
-        variances = (2 * _Within.apply(self.head(features), *self.bounds)).exp()
+        variances = (2 * Clamp.apply(self.head(features), *self.bounds)).exp()
         return variances.split(self.sizes, -1)
 
 
@@ -218,7 +198,7 @@ class StateDependentSpread(nn.Module):
 
     def scales(self) -> tuple[Tensor, Tensor]:
         """S_x [H, H] and S_a [H, n]; rows are the features that cause noise."""
-        log_std = _Within.apply(self.log_std, *self.bounds) - math.log(self.sizes[0]) / 2
+        log_std = Clamp.apply(self.log_std, *self.bounds) - math.log(self.sizes[0]) / 2
         scale = torch.where(log_std <= 0, log_std.exp(), 1 + log_std.clamp_min(0).log1p())
         return scale.split(self.sizes, -1)
 
@@ -318,8 +298,7 @@ def make_lattice_actor(
         )
     if not hidden:
         raise ValueError("hidden is empty; Lattice perturbs a last hidden layer, so give one.")
-    if alpha < 0 or std_reg < 0:
-        raise ValueError(f"alpha is {alpha} and std_reg is {std_reg}; neither may be negative.")
+    check_real("[0, inf)", alpha=alpha, std_reg=std_reg)
     n = action_spec.shape[-1]
     layers = make_layers(sum(inputs.values()), n, body, hidden, layer_norm)
     if state_dependent:

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, step_mdp
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_integer, check_real
 from torchrl_etl.envs import body_joints, mujoco_state
 from torchrl_etl.extras import extra
 
@@ -65,8 +65,7 @@ def record_muscle_lengths(
         torch.Size([20, 1])
     """
     check_integer(1, frames=frames, every=every)
-    if not amplitude > 0:
-        raise ValueError(f"amplitude is {amplitude}; it is a largest velocity and must be above 0.")
+    check_real("(0, inf)", amplitude=amplitude)
     if env.batch_size:
         raise ValueError(
             f"The environment has batch size {list(env.batch_size)}; muscle lengths are recorded "

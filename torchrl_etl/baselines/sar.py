@@ -10,7 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_integer, check_real
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.synergies.sar import independent_components
@@ -245,8 +245,7 @@ def best_episodes(
             f"{None if episodes is None else list(episodes.shape)}; they must be [N, actuators], "
             "[N] and [N], with N of 1 or more."
         )
-    if not 0 <= percentile <= 100:
-        raise ValueError(f"percentile is {percentile}; it must be in [0, 100].")
+    check_real("[0, 100]", percentile=percentile)
     returns = returns.reshape(-1).double()
     counted = returns
     if episodes is not None:

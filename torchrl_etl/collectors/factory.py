@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
+from torchrl_etl.checks import check_choice
 from torchrl_etl.collectors.batches import Batches
 from torchrl_etl.collectors.process import AsyncProcessWorkers, ProcessWorkers
 from torchrl_etl.collectors.vector import VectorCollector
@@ -65,6 +66,7 @@ def make_batches(
         ValueError: for an unknown kind or bad arguments.
         ImportError: if the engine of a kind is not installed.
     """
+    check_choice("kind", kind, COLLECTORS)
     common = {"frames_per_batch": frames_per_batch, "total_frames": -1}
     trusting = {"trust_policy": True, "auto_register_policy_transforms": False}
     workers = {**common, "num_workers": num_workers, "collector_class": collector_class}
@@ -90,4 +92,3 @@ def make_batches(
 
             make = partial(DistributedWorkers, make_env, policy, **remote, **distributed or {})
             return Batches(make, restarts=False, timeout=2 * timeout)
-    raise ValueError(f"kind is {kind!r}; choose one of {', '.join(COLLECTORS)}.")

@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from torchrl_etl.checks import check_choice
+
 __all__ = ["AnalyticOveractuated"]
 
 
@@ -76,8 +78,7 @@ class AnalyticOveractuated(gym.Env):
             raise ValueError(
                 f"num_joints must be between 1 and num_muscles={num_muscles}, got {num_joints}."
             )
-        if goal not in ("fixed", "random"):
-            raise ValueError(f"goal must be 'fixed' or 'random', got {goal!r}.")
+        check_choice("goal", goal, ("fixed", "random"))
         rng = np.random.default_rng(matrix_seed)
         self._basis = np.linalg.qr(rng.standard_normal((num_muscles, num_joints)))[0].T
         self._matrix = self._basis / np.abs(self._basis).sum(axis=1, keepdims=True)

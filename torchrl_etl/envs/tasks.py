@@ -9,10 +9,11 @@ from __future__ import annotations
 import difflib
 import re
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import gymnasium as gym
 
+from torchrl_etl.checks import check_choice
 from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.own_tasks import import_own_task
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
@@ -195,8 +196,8 @@ myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
     """
     if not isinstance(name, str):
         raise TypeError(f"A task is named by a string, got {type(name).__name__}.")
-    if goal not in (None, "fixed", "random"):
-        raise ValueError(f"goal must be 'fixed' or 'random', got {goal!r}.")
+    if goal is not None:
+        check_choice("goal", goal, get_args(Goal))
     if name in _BY_NAME:
         task = replace(_BY_NAME[name], goal=goal or "fixed")
     elif name in _BY_ID:

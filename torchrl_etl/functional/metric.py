@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrl_etl.checks import check_choice, check_real
+
 __all__ = [
     "direction_bonus",
     "discriminability",
@@ -211,8 +213,7 @@ def expected_distance(mean_abs_reward_difference: Tensor | float, gamma: float) 
         >>> round(expected_distance(0.5, 0.9), 6)
         5.0
     """
-    if not 0.0 <= gamma < 1.0:
-        raise ValueError(f"gamma must be in [0, 1) for the series to converge, got {gamma}.")
+    check_real("[0, 1)", gamma=gamma)  # for the series to converge
     return mean_abs_reward_difference / (1.0 - gamma)
 
 
@@ -266,12 +267,11 @@ def discriminability(
         >>> discriminability(*same, *pair, epsilon=0.005)
         tensor(0.)
     """
+    check_choice("form", form, ("hinge", "literal"))
     if form == "hinge":
         penalty = (margin - l2_distance(embedding_i, embedding_j)).clamp_min(0.0).square()
-    elif form == "literal":
-        penalty = (embedding_i - embedding_j).square().sum(-1)
     else:
-        raise ValueError(f"form must be 'hinge' or 'literal', got {form!r}.")
+        penalty = (embedding_i - embedding_j).square().sum(-1)
     alike = (reward_i - reward_j).abs() < epsilon
     return torch.where(alike, penalty, torch.zeros_like(penalty))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP
 
 from torchrl_etl.checks import check_integer
+from torchrl_etl.modules.clamp import Clamp
 from torchrl_etl.modules.recorded_actions import as_bounds
 
 __all__ = ["GMVAE", "ActionDecoder", "Posterior"]
@@ -22,26 +24,6 @@ class Posterior(NamedTuple):
     logits: Tensor
     loc: Tensor
     scale: Tensor
-
-
-class _AtLeast(torch.autograd.Function):
-    """A lower bound whose gradient still passes where it pulls the input up, out of the bound."""
-
-    generate_vmap_rule = True  # both ways are made of operations that torch.vmap knows
-
-    @staticmethod
-    def forward(value: Tensor, bound: float) -> Tensor:
-        return value.clamp_min(bound)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
-        value, bound = inputs
-        ctx.save_for_backward(value >= bound)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (inside,) = ctx.saved_tensors
-        return gradient * (inside | (gradient < 0)), None
 
 
 class ActionDecoder(nn.Module):
@@ -241,7 +223,7 @@ class GMVAE(nn.Module):
         Bounded below: on actions that d latents explain exactly the likelihood has no maximum. A
         scale at its bound can grow again when the actions get more varied, as they do in stage 1.
         """
-        return _AtLeast.apply(self.likelihood_log_scale, -4.0).exp()
+        return Clamp.apply(self.likelihood_log_scale, -4.0, math.inf).exp()
 
     def normalize(self, action: Tensor) -> Tensor:
         """Map actions [*, n] from [low, high] to [-1, 1]."""

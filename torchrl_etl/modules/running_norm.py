@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchrl_etl.checks import check_integer, check_real
 from torchrl_etl.modules.running_moments import RunningMoments
 
 __all__ = ["RunningNorm"]
@@ -37,10 +38,8 @@ class RunningNorm(RunningMoments):
     """
 
     def __init__(self, size: int, *, clip: float = 10.0) -> None:
-        if size < 1:
-            raise ValueError(f"size is {size}; it is the length of an observation, 1 or more.")
-        if not clip > 0.0:
-            raise ValueError(f"clip is {clip}; it is the largest magnitude and must be above 0.")
+        check_integer(1, size=size)
+        check_real("(0, inf)", clip=clip)
         super().__init__((size,))
         self.clip = clip
 

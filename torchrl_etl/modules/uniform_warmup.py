@@ -9,6 +9,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_etl.checks import check_integer
+
 __all__ = ["UniformWarmup"]
 
 
@@ -54,8 +56,7 @@ class UniformWarmup(TensorDictModuleBase):
     def __init__(
         self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"
     ) -> None:
-        if frames < 0:
-            raise ValueError(f"frames is {frames}; it is a number of actions, 0 or more.")
+        check_integer(0, frames=frames)
         super().__init__()
         self.frames, self.seen = frames, 0
         self.action_key = unravel_key(action_key)

@@ -143,13 +143,6 @@ class GMVAELoss(LossModule):
 
     def reset_parameters_recursive(self) -> None:
         """Put the model back to fresh initial parameters, its prior included."""
-        gmvae = self.gmvae
-        fresh = GMVAE(
-            gmvae.action_dim,
-            gmvae.latent_dim,
-            gmvae.num_components,
-            low=self.gmvae_params["decoder", "low"].tolist(),
-            high=self.gmvae_params["decoder", "high"].tolist(),
-            hidden=tuple(reversed(gmvae.decoder.hidden)),
-        )
-        self.from_stateful_net("gmvae", fresh.to(self._default_device))
+        with self.gmvae_params.to_module(self.gmvae, preserve_module_state=False):
+            config = self.gmvae.config
+        self.from_stateful_net("gmvae", GMVAE(**config).to(self._default_device))

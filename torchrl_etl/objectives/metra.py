@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["METRALoss"]
@@ -112,9 +112,7 @@ class METRALoss(LossModule):
         check_choice("norm", norm, ("sum", "mean"))
         check_choice("reduction", reduction, ("mean", "sum", "none"))
         check_parts("encoder", encoder, TensorDictModuleBase, outputs=1)
-        for name, value in (("epsilon", epsilon), ("lambda_init", lambda_init)):
-            if not value > 0.0:
-                raise ValueError(f"{name} is {value}; it must be positive.")
+        check_real("(0, inf)", epsilon=epsilon, lambda_init=lambda_init)
         super().__init__()
         self.epsilon, self.lambda_init = epsilon, lambda_init
         self.norm, self.reduction = norm, reduction

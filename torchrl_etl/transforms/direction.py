@@ -7,13 +7,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_etl.checks import check_choice, check_integer
-from torchrl_etl.transforms.keys import SoleWriter, group_reset, group_shape, set_leaf
+from torchrl_etl.transforms.keys import SoleWriter, group_shape, set_leaf, set_where_reset
 
 __all__ = ["DirectionPrimer"]
 
@@ -131,23 +131,22 @@ class DirectionPrimer(SoleWriter, TensorDictPrimer):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # A draw for every env: at a partial reset the env keeps those of the envs that reset.
+        return tensordict_reset.set(self.out_keys[0], self._drawn_for(tensordict_reset))
+
+    def _drawn_for(self, tensordict_reset: TensorDictBase) -> Tensor:
         (key,) = self.out_keys
         shape = tensordict_reset.batch_size
         if self.parent is not None:  # an env that is not batch-locked leaves its size to the data
             shape = shape + group_shape(self.parent, key)[self.parent.ndim :]
         elif not isinstance(key, str) and key[:-1] in tensordict_reset.keys(True):
             shape = tensordict_reset.get(key[:-1]).batch_size
-        return tensordict_reset.set(key, self.draw(shape, tensordict_reset.device))
+        return self.draw(shape, tensordict_reset.device)
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # Here nobody merges by the reset mask for us.
-        (key,) = self.out_keys
-        present = tensordict.get(key)
-        fresh = self._reset_func(tensordict, tensordict_reset).get(key)
-        reset = expand_as_right(group_reset(self.parent, tensordict, key), fresh)
-        return tensordict_reset.set(key, torch.where(reset, fresh, present))
+        fresh = self._drawn_for(tensordict_reset)
+        return set_where_reset(self.parent, tensordict, tensordict_reset, self.out_keys[0], fresh)
 
     def array_step(self, now: dict[NestedKey, Any], after: dict[NestedKey, Any]) -> None:
         """See :class:`~torchrl_etl.collectors.VectorCollector`."""

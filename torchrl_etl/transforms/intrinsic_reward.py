@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_etl.functional import direction_bonus
+from torchrl_etl.transforms.keys import check_network
 from torchrl_etl.transforms.scaled_bonus import ScaledBonus
 from torchrl_etl.transforms.transition_reward import evaluate
 
@@ -110,16 +111,7 @@ class IntrinsicReward(ScaledBonus):
         out_key: NestedKey = "intrinsic_reward",
         **scale: Any,
     ) -> None:
-        if not (hasattr(encoder, "in_keys") and hasattr(encoder, "out_keys")):
-            raise TypeError(
-                f"The encoder is a {type(encoder).__name__} without in_keys and out_keys; wrap it "
-                "in a tensordict.nn.TensorDictModule."
-            )
-        if len(encoder.in_keys) != 1 or len(encoder.out_keys) != 1:
-            raise ValueError(
-                f"The encoder reads {list(encoder.in_keys)} and writes {list(encoder.out_keys)}; "
-                "it must read one observation and write one embedding."
-            )
+        check_network("encoder", encoder, ["one observation"], "one embedding")
         if isinstance(in_keys, str) or len(in_keys) != 2:
             raise ValueError(
                 f"in_keys is {in_keys!r}; pass a pair of keys, the observation and the direction."

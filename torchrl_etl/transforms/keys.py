@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, expand_right, unravel_key
+from tensordict.utils import NestedKey, expand_as_right, expand_right, unravel_key
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, TensorDictPrimer, Transform
 
-__all__ = ["SoleWriter", "group_reset", "group_shape", "private_key", "set_leaf"]
+__all__ = [
+    "SoleWriter",
+    "check_network",
+    "group_shape",
+    "private_key",
+    "set_leaf",
+    "set_where_reset",
+]
 
 
 def group_shape(env: EnvBase, key: NestedKey) -> torch.Size:
@@ -42,7 +50,22 @@ def set_leaf(spec: Composite, key: NestedKey, leaf: TensorSpec, env: EnvBase) ->
     spec[key] = leaf
 
 
-def group_reset(env: EnvBase, tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
+def set_where_reset(
+    env: EnvBase,
+    tensordict: TensorDictBase,
+    tensordict_reset: TensorDictBase,
+    key: NestedKey,
+    fresh: Tensor,
+) -> TensorDictBase:
+    """Set ``fresh`` where the group of ``key`` begins a new episode, and what is there elsewhere.
+
+    At a native autoreset nobody else merges by the reset mask.
+    """
+    reset = expand_as_right(_group_reset(env, tensordict, key), fresh)
+    return tensordict_reset.set(key, torch.where(reset, fresh, tensordict.get(key)))
+
+
+def _group_reset(env: EnvBase, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """Which elements of the group of ``key`` begin a new episode, a mask of the group's shape."""
     path = (key,) if isinstance(key, str) else key
     own = [
@@ -65,6 +88,31 @@ def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
     *group, name = (key,) if isinstance(key, str) else key
     owner = owner if isinstance(owner, str) else owner[-1]
     return unravel_key((*group, f"_{owner}_{name}"))
+
+
+def check_network(name: str, network: object, reads: Sequence[str], writes: str) -> None:
+    """Refuse a network that has no keys, or more or fewer than a transform hands it.
+
+    Args:
+        name (str): what an error calls it.
+        network (TensorDictModuleBase): must read as many keys, and write one.
+        reads (sequence of str): what these are, in words.
+        writes (str): what that is, in words.
+
+    Raises:
+        TypeError: if it has no keys.
+        ValueError: if it has others.
+    """
+    if not (hasattr(network, "in_keys") and hasattr(network, "out_keys")):
+        raise TypeError(
+            f"The {name} is a {type(network).__name__} without in_keys and out_keys; wrap it in a "
+            "tensordict.nn.TensorDictModule."
+        )
+    if len(network.in_keys) != len(reads) or len(network.out_keys) != 1:
+        raise ValueError(
+            f"The {name} reads {list(network.in_keys)} and writes {list(network.out_keys)}; it "
+            f"must read {' and '.join(reads)}, and write {writes}."
+        )
 
 
 class SoleWriter(Transform):

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Composite, ReplayBuffer, TensorSpec
 from torchrl.envs.transforms import ModuleTransform, TransformedEnv
 
-from torchrl_etl.transforms.keys import group_reset, private_key, set_leaf
+from torchrl_etl.transforms.keys import check_network, private_key, set_leaf, set_where_reset
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -101,16 +101,7 @@ class LatentAction(ModuleTransform):
         action_key: NestedKey | None = None,
         decoded_key: NestedKey | None = None,
     ) -> None:
-        if not hasattr(module, "in_keys") or not hasattr(module, "out_keys"):
-            raise TypeError(
-                f"The module is a {type(module).__name__} without keys; wrap it, as in "
-                "TensorDictModule(module, in_keys=['latent'], out_keys=['action'])."
-            )
-        if len(module.in_keys) != 1 or len(module.out_keys) != 1:
-            raise ValueError(
-                f"The module reads {list(module.in_keys)} and writes {list(module.out_keys)}; it "
-                "must read one latent action and write one action."
-            )
+        check_network("module", module, ["one latent action"], "one action")
         super().__init__(module=module, inverse=True, no_grad=True)
         self.latent_spec, self.latent_key = latent_spec, unravel_key(latent_key)
         self.executed_key = unravel_key(executed_key)
@@ -192,13 +183,8 @@ class LatentAction(ModuleTransform):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # Here nobody merges by the reset mask for us.
         rest = self.rest(tensordict_reset.batch_size)
-        reset = group_reset(self.parent, tensordict, self.executed_key)
-        present = tensordict.get(self.executed_key)
-        return tensordict_reset.set(
-            self.executed_key, torch.where(expand_as_right(reset, rest), rest, present)
-        )
+        return set_where_reset(self.parent, tensordict, tensordict_reset, self.executed_key, rest)
 
     def rest(self, batch_size: torch.Size) -> Tensor:
         """What counts as executed before the first step: zeros brought into the bounds."""

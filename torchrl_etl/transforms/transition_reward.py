@@ -5,14 +5,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from torchrl_etl.transforms.keys import SoleWriter, group_reset, private_key, set_leaf
+from torchrl_etl.transforms.keys import SoleWriter, private_key, set_leaf, set_where_reset
 
 __all__ = ["TransitionReward", "evaluate"]
 
@@ -97,12 +96,8 @@ class TransitionReward(SoleWriter):
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # Here nobody merges by the reset mask for us.
         fresh = self._read(tensordict_reset, self.in_keys[0])
-        reset = group_reset(self.parent, tensordict, self._copy_key)
-        present = tensordict.get(self._copy_key)
-        kept = torch.where(expand_as_right(reset, fresh), fresh, present)
-        return tensordict_reset.set(self._copy_key, kept)
+        return set_where_reset(self.parent, tensordict, tensordict_reset, self._copy_key, fresh)
 
     def _keep(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self._copy_key, self._read(tensordict, self.in_keys[0]).clone())
