@@ -103,7 +103,7 @@ def test_a_failed_drawing_leaves_the_old_picture_and_no_litter(tmp_path, monkeyp
     before = path.read_bytes()
 
     def half_written(self, target, **kwargs):
-        target.write_bytes(b"half")
+        target.write(b"half")
         raise OSError("disk full")
 
     monkeypatch.setattr(Figure, "savefig", half_written)

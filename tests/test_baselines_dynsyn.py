@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from tests import test_objectives_synergy_sac as synergy
+from tests import test_objectives_sac as plain
 from torchrl_etl.baselines.dynsyn import (
     GroupedTanhNormal,
     MuscleGroups,
@@ -291,30 +291,14 @@ def test_acts_on_bare_arrays_as_the_vector_collector_has_them() -> None:
             torch.testing.assert_close(torch.from_numpy(action), expected)
 
 
-class TestDynSynSAC(synergy.TestSynergySACLoss):
+def trained_actor(inputs: Any, spec: Bounded, **options: Any) -> Any:
+    actor = make_dynsyn_actor(inputs, spec, [0, 1, 0, 1, 1], **options)
+    set_frames(actor, 2_000_000)
+    return actor
+
+
+class TestDynSynSAC(plain.TestLeanSACLoss):
     """LeanSACLoss on a DynSyn actor passes the check list of losses."""
 
-    default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
-    trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
-
-    def make_loss(self, *, nested: bool = False, **kwargs: Any) -> LeanSACLoss:
-        def at(name: str) -> Any:
-            return ("agent", name) if nested else name
-
-        spec = Bounded(0.0, 1.0, shape=(synergy.ACTION,))
-        actor = make_dynsyn_actor(
-            {at("observation"): synergy.OBSERVATION},
-            spec,
-            [0, 1, 0, 1, 1],
-            out_key=at("action"),
-            hidden=(16, 16),
-        )
-        set_frames(actor, 2_000_000)
-        critic = make_critic(
-            {at("observation"): synergy.OBSERVATION, at("action"): synergy.ACTION}, hidden=(16, 16)
-        )
-        loss = LeanSACLoss(actor, critic, **{"target_entropy": -1.0, **kwargs})
-        if nested:
-            loss.set_keys(**{name: at(name) for name in ("reward", "done", "terminated")})
-        loss.make_value_estimator(gamma=synergy.GAMMA)
-        return loss
+    def make_loss(self, **kwargs: Any) -> LeanSACLoss:
+        return plain.make_loss(make_actor=trained_actor, **kwargs)

@@ -18,6 +18,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SoftUpdate
 
+from tests.lookup_tables import Lookup, table, transitions
 from tests.loss_checks import LossChecks
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM
 from torchrl_etl.baselines import EMELoss, RewardEnsemble
@@ -111,25 +112,12 @@ class TestNoTarget(TestEMELoss):
     targets = set()
 
 
-# Numbers on lookup tables: observation i one-hot -> row i.
-
-
-class Lookup(nn.Module):
-    def __init__(self, rows: list[list[float]]) -> None:
-        super().__init__()
-        self.rows = nn.Parameter(torch.tensor(rows))
-
-    def forward(self, observation: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        return observation @ self.rows
+# Numbers on lookup tables
 
 
 class Gaussian(Lookup):
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return super().forward(observation).chunk(2, -1)
-
-
-def table(rows: list[list[float]]) -> TensorDictModule:
-    return TensorDictModule(Lookup(rows), in_keys=["observation"], out_keys=["embedding"])
 
 
 def predictors(rows: list[list[float]]) -> TensorDictModule:
@@ -146,24 +134,6 @@ def policy(loc: list[list[float]], scale: list[list[float]]) -> ProbabilisticAct
     )
 
 
-def transitions(
-    states: list[int], following: list[int], rewards: list[float], ended: list[bool], num: int
-) -> TensorDict:
-    one_hot = torch.eye(num)
-    return TensorDict(
-        {
-            "observation": one_hot[states],
-            "action": torch.zeros(len(states), 1),
-            "next": {
-                "observation": one_hot[following],
-                "reward": torch.tensor(rewards).unsqueeze(-1),
-                "terminated": torch.tensor(ended).unsqueeze(-1),
-            },
-        },
-        [len(states)],
-    )
-
-
 ROWS = [[0.0, 0.0], [3.0, 4.0], [0.0, 6.0]]
 D01, D02, D12 = 5.0, 6.0, 13**0.5
 LOC, SCALE = [[0.0], [1.0], [3.0]], [[1.0], [2.0], [0.5]]
@@ -172,7 +142,7 @@ PREDICTIONS = [[0.0, 2.0], [1.0, 1.0], [0.0, 1.0]]  # variances 1, 0, 1/4
 
 def loss_of_tables(**options: Any) -> EMELoss:
     options = {"gamma": 0.5, "loss_function": "l2", "subset_share": 1.0} | options
-    return EMELoss(table(ROWS), predictors(PREDICTIONS), policy(LOC, SCALE), **options)
+    return EMELoss(table(*ROWS), predictors(PREDICTIONS), policy(LOC, SCALE), **options)
 
 
 def kl(i: int, j: int) -> float:
@@ -184,7 +154,7 @@ def test_divergence_of_policies_is_that_of_torch() -> None:
     torch.manual_seed(0)
     loc, scale = torch.randn(2, 6), 0.1 + torch.rand(2, 6)
     actor = policy(loc.tolist(), scale.tolist())
-    loss = EMELoss(table(ROWS[:2]), predictors(PREDICTIONS[:2]), actor)
+    loss = EMELoss(table(*ROWS[:2]), predictors(PREDICTIONS[:2]), actor)
     out = loss(transitions([0, 1], [1, 0], [0.0, 0.0], [False, False], 2))
     first, second = (Independent(Normal(*row), 1) for row in zip(loc, scale, strict=True))
     expected = (kl_divergence(first, second) + kl_divergence(second, first)) / 2
@@ -273,7 +243,7 @@ def test_distances_on_a_cycle_come_to_the_fixed_point() -> None:
     torch.manual_seed(0)
     # 0 -> 1 -> 2 -> 0 with rewards 0, 1, 2; divergences 1/2, 1/2 and 0, the same both ways.
     actor = policy([[0.0], [1.0], [0.0]], [[1.0]] * 3)
-    encoder = table((0.1 * torch.randn(3, 2)).tolist())
+    encoder = table(*(0.1 * torch.randn(3, 2)).tolist())
     loss = EMELoss(encoder, predictors(PREDICTIONS), actor, gamma=0.5, loss_function="l2")
     updater = FusedSoftUpdate(loss, tau=0.05)
     data = transitions([0, 1, 2], [1, 2, 0], [0.0, 1.0, 2.0], [False] * 3, 3)
@@ -298,7 +268,7 @@ def test_policies_that_always_differ_by_c_are_c_over_one_minus_gamma_apart(
     actor = policy([[0.0], [2.0]], [[1.0], [1.0]])
     data = transitions([0, 1], [0, 1], [0.0, 0.0], [False, False], 2)
     for distance, error in ((2.0 * times, 0.0), (2.0 * times + 1, (1 - gamma) ** 2)):
-        encoder = table([[0.0], [distance]])
+        encoder = table([0.0], [distance])
         out = EMELoss(encoder, predictors([[0.0], [0.0]]), actor, gamma=gamma, loss_function="l2")(
             data
         )
@@ -346,7 +316,7 @@ def test_wrong_options_are_refused_at_construction(options: dict[str, Any], mess
 
 
 def test_plain_networks_are_refused() -> None:
-    parts = table(ROWS), predictors(PREDICTIONS), policy(LOC, SCALE)
+    parts = table(*ROWS), predictors(PREDICTIONS), policy(LOC, SCALE)
     for index, name in enumerate(("encoder", "ensemble", "actor")):
         wrong = [nn.Linear(2, 2) if i == index else part for i, part in enumerate(parts)]
         with pytest.raises(TypeError, match=f"{name} is a Linear"):

@@ -14,19 +14,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.objectives import SoftUpdate
 
+from tests.lookup_tables import table, transitions
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, PointEnv
-from tests.test_baselines_eme import (
-    D12,
-    LOC,
-    PREDICTIONS,
-    ROWS,
-    SCALE,
-    fixed,
-    policy,
-    predictors,
-    table,
-    transitions,
-)
+from tests.test_baselines_eme import D12, LOC, PREDICTIONS, ROWS, SCALE, fixed, policy, predictors
 from tests.transform_checks import TransformChecks
 from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
 from torchrl_etl.modules import StateEncoder
@@ -116,7 +106,7 @@ class TestEMEBonus(TransformChecks):
 
 def bonus_of_tables(**options: Any) -> EMEBonus:
     """Distances 5, 6 and sqrt(13); variances 1/4, 4 and 25 at states 0, 1 and 2."""
-    return EMEBonus(table(ROWS), predictors([[0.0, 1.0], [0.0, 4.0], [0.0, 10.0]]), **options)
+    return EMEBonus(table(*ROWS), predictors([[0.0, 1.0], [0.0, 4.0], [0.0, 10.0]]), **options)
 
 
 def steps(states: list[int], following: list[int], rewards: list[float]) -> TensorDict:
@@ -183,7 +173,7 @@ def test_a_state_that_does_not_change_earns_nothing() -> None:
 
 
 def test_bonus_follows_the_loss_that_trains_its_networks() -> None:
-    encoder, ensemble = table(ROWS), predictors(PREDICTIONS)
+    encoder, ensemble = table(*ROWS), predictors(PREDICTIONS)
     loss = EMELoss(encoder, ensemble, policy(LOC, SCALE))
     SoftUpdate(loss, tau=0.1)
     bonus = EMEBonus(encoder, ensemble)

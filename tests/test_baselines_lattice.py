@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,13 +13,13 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from tests import test_objectives_synergy_sac as synergy
+from tests import test_objectives_sac as plain
 from torchrl_etl.baselines.lattice import (
     LatticeNormal,
     StateDependentSpread,
     make_lattice_actor,
 )
-from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.modules import make_actor
 from torchrl_etl.objectives import LeanSACLoss
 
 LOW, HIGH = torch.tensor([0.0, -1.0, -3.0]), torch.tensor([1.0, 1.0, 5.0])
@@ -209,37 +210,14 @@ def test_follows_its_module_to_another_precision(kind: dict[str, bool]) -> None:
 # In SAC
 
 
-class TestLatticeSAC(synergy.TestSynergySACLoss):
+class TestLatticeSAC(plain.TestLeanSACLoss):
     """LeanSACLoss on a Lattice actor passes the check list of losses."""
 
-    default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
-    trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
     state_dependent = False
 
-    def make_loss(self, *, nested: bool = False, **kwargs: Any) -> LeanSACLoss:
-        def at(name: str) -> Any:
-            return ("agent", name) if nested else name
-
-        spec = Bounded(0.0, 1.0, shape=(synergy.ACTION,))
-        loss = LeanSACLoss(
-            make_lattice_actor(
-                {at("observation"): synergy.OBSERVATION},
-                spec,
-                out_key=at("action"),
-                hidden=(16, 16),
-                state_dependent=self.state_dependent,
-                log_std_init=-1.0,
-            ),
-            make_critic(
-                {at("observation"): synergy.OBSERVATION, at("action"): synergy.ACTION},
-                hidden=(16, 16),
-            ),
-            **{"target_entropy": -1.0, **kwargs},
-        )
-        if nested:
-            loss.set_keys(**{name: at(name) for name in ("reward", "done", "terminated")})
-        loss.make_value_estimator(gamma=synergy.GAMMA)
-        return loss
+    def make_loss(self, **kwargs: Any) -> LeanSACLoss:
+        options = {"state_dependent": self.state_dependent, "log_std_init": -1.0}
+        return plain.make_loss(make_actor=partial(make_lattice_actor, **options), **kwargs)
 
 
 class TestStateDependentLatticeSAC(TestLatticeSAC):

@@ -12,10 +12,8 @@ from torch.nn.functional import softmax
 from torchrl.objectives import SoftUpdate
 
 from tests import test_objectives_sac as plain
-from tests import test_objectives_synergy_sac as synergy
 from tests.loss_checks import SEED
 from torchrl_etl.functional import categorical_mean, project_categorical
-from torchrl_etl.objectives import LeanSACLoss
 
 SUPPORT = torch.linspace(-2.0, 2.0, 5)
 
@@ -39,12 +37,8 @@ def test_projection_keeps_the_mass_and_within_the_ends_the_mean():
 make_loss = partial(plain.make_loss, bins=len(SUPPORT), support=SUPPORT)
 
 
-class TestCategoricalSACLoss(synergy.TestSynergySACLoss):
-    default_keys = synergy.TestSynergySACLoss.default_keys | {"action": "action"}
-    trained = synergy.TestSynergySACLoss.trained | {"loss_actor": {"actor_network_params"}}
-
-    def make_loss(self, *, nested: bool = False, **kwargs) -> LeanSACLoss:
-        return make_loss(nested=nested, **kwargs)
+class TestCategoricalSACLoss(plain.TestLeanSACLoss):
+    make_loss = staticmethod(make_loss)
 
 
 def batch(size: int = 6) -> TensorDict:

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
+from tests.lookup_tables import table, transitions
 from tests.loss_checks import LossChecks
 from torchrl_etl.modules import GaussianDynamics, StateEncoder
 from torchrl_etl.objectives import BehavioralMetricLoss
@@ -85,30 +86,7 @@ class TestGaussian(MetricChecks):
         return [GaussianDynamics(EMBEDDING_DIM, hidden=(16,))]
 
 
-# Numbers on a lookup table of embeddings: observation i one-hot -> row i.
-
-
-def table(*rows: list[float]) -> TensorDictModule:
-    network = nn.Linear(len(rows), len(rows[0]), bias=False)
-    network.weight.data = torch.tensor(rows).T.contiguous()
-    return TensorDictModule(network, in_keys=["observation"], out_keys=["embedding"])
-
-
-def transitions(
-    states: list[int], following: list[int], rewards: list[float], ended: list[bool], num: int
-) -> TensorDict:
-    one_hot = torch.eye(num)
-    return TensorDict(
-        {
-            "observation": one_hot[states],
-            "next": {
-                "observation": one_hot[following],
-                "reward": torch.tensor(rewards).unsqueeze(-1),
-                "terminated": torch.tensor(ended).unsqueeze(-1),
-            },
-        },
-        [len(states)],
-    )
+# Numbers on a lookup table of embeddings
 
 
 ROWS = [0.0, 0.0], [3.0, 4.0], [0.0, 6.0]

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import nn
 
+from tests.lookup_tables import steps, table
 from tests.loss_checks import LossChecks
 from torchrl_etl.modules import StateEncoder
 from torchrl_etl.objectives.metra import METRALoss
@@ -48,27 +48,13 @@ class TestMeanNorm(TestMETRALoss):
         return super().make_loss(norm="mean", **kwargs)
 
 
-# Numbers on a lookup table of embeddings: observation i one-hot -> row i.
-
-
-def table(*rows: list[float]) -> TensorDictModule:
-    network = nn.Linear(len(rows), len(rows[0]), bias=False)
-    network.weight.data = torch.tensor(rows).T.contiguous()
-    return TensorDictModule(network, in_keys=["observation"], out_keys=["embedding"])
+# Numbers on a lookup table of embeddings
 
 
 def transitions(
     states: list[int], following: list[int], directions: list[list[float]], num: int
 ) -> TensorDict:
-    one_hot = torch.eye(num)
-    return TensorDict(
-        {
-            "observation": one_hot[states],
-            "direction": torch.tensor(directions),
-            "next": {"observation": one_hot[following]},
-        },
-        [len(states)],
-    )
+    return steps(states, following, num, direction=torch.tensor(directions))
 
 
 # Steps (3, 4), of length 5, and (0.3, 0.4), of length 0.5.

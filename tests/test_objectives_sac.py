@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from typing import Any
@@ -32,6 +33,7 @@ def make_loss(
     kind: type[SACLoss] = LeanSACLoss,
     *,
     nested: bool = False,
+    make_actor: Callable[..., ProbabilisticActor] = make_actor,
     hidden: int = 16,
     bins: int = 1,
     **kwargs: Any,

@@ -105,21 +105,13 @@ def test_root_at_reset_is_zero_brought_into_the_bounds():
     assert env.reset()["executed_action"].eq(0.25).all()
 
 
-def test_partial_reset_returns_the_reset_env_to_rest():
-    env = TransformedEnv(PointEnv((3,)), SynergyAction(fixed_decoder()))
-    state = env.rollout(2)[:, -1]["next"].exclude("reward")
-    before = state["executed_action"].clone()
-    after = env.reset(state.set("_reset", torch.tensor([[False], [True], [False]])))
-    assert after["executed_action"][1].eq(0).all()
-    assert torch.equal(after["executed_action"][[0, 2]], before[[0, 2]])
-
-
-def test_native_autoreset_returns_only_the_reset_env_to_rest():
+@pytest.mark.parametrize("native", [False, True])
+def test_a_reset_of_one_env_returns_only_that_one_to_rest(native):
     env = TransformedEnv(PointEnv((3,)), SynergyAction(fixed_decoder()))
     state = env.rollout(2)[:, -1]["next"].exclude("reward")
     before = state["executed_action"].clone()
     state = state.set("_reset", torch.tensor([[False], [True], [False]]))
-    after = env._reset_on_native_autoreset(state, state)
+    after = env._reset_on_native_autoreset(state, state) if native else env.reset(state)
     assert after["executed_action"][1].eq(0).all()
     assert torch.equal(after["executed_action"][[0, 2]], before[[0, 2]])
 

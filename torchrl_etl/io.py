@@ -129,10 +129,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     try:
         fresh.mkdir()
         for name, content in files.items():
-            with open(fresh / name, "xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            _write_to_disk(fresh / name, content)
         flush_folder(fresh)
         if folder.exists():
             shutil.rmtree(aside, ignore_errors=True)
@@ -166,12 +163,16 @@ def _aside(folder: Path) -> Path:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file, whole or not at all, and flush it to disk."""
     scratch = path.with_name(f".{path.name}.tmp")
-    with scratch.open("wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
+    _write_to_disk(scratch, content.encode() if isinstance(content, str) else content)
     os.replace(scratch, path)
     flush_folder(path.parent)
+
+
+def _write_to_disk(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def as_json(content: Any) -> str:

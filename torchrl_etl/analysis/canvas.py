@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_etl.extras import extra
+from torchrl_etl.io import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,13 +63,9 @@ def count_frames(axes: Axes) -> None:
 
 
 def write(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Save as PNG under a temporary name, then move into place: nobody sees half a picture."""
+    """Save as PNG, whole or not at all: nobody sees half a picture."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        figure.savefig(unfinished, format="png")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    figure.savefig(content := BytesIO(), format="png")
+    write_atomically(path, content.getvalue())
     return path

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchrl_etl.analysis.arrays import as_array, as_matrix
-from torchrl_etl.extras import extra
+from torchrl_etl.synergies.factors import make_nmf, principal_components, unfinished
 
 __all__ = ["nmf_vaf", "pca_vaf", "variance_accounted_for"]
 
@@ -79,12 +77,7 @@ def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int
     """
     actions = _subsample(as_matrix(actions, "actions"), max_samples)
     _check_rank(num_synergies, actions)
-    with extra("synergies"):
-        from sklearn.decomposition import PCA
-    # scikit-learn divides by the total variance on its way, which constant actions do not have;
-    # the components are good either way.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        model = PCA(num_synergies, svd_solver="covariance_eigh").fit(actions)
+    model = principal_components(actions, num_synergies, svd_solver="covariance_eigh")
     return variance_accounted_for(actions, model.inverse_transform(model.transform(actions)))
 
 
@@ -129,13 +122,8 @@ def nmf_vaf(
             "actions' own spec as low."
         )
     shifted = shifted.clip(min=0.0)
-    with extra("synergies"):
-        from sklearn.decomposition import NMF
-        from sklearn.exceptions import ConvergenceWarning
-    model = NMF(num_synergies, init="nndsvda", max_iter=500, random_state=0)
-    with warnings.catch_warnings():
-        # The last digits that more iterations would bring do not change a verdict.
-        warnings.simplefilter("ignore", ConvergenceWarning)
+    model = make_nmf(num_synergies)
+    with unfinished():
         weights = model.fit_transform(shifted)
     return variance_accounted_for(shifted, weights @ model.components_)
 

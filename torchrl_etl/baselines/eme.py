@@ -18,7 +18,7 @@ from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_uniform
 from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
 from torchrl_etl.objectives.checks import check_parts
-from torchrl_etl.objectives.pairs import outputs, partners
+from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners
 
 __all__ = ["EMELoss"]
 
@@ -201,18 +201,14 @@ class EMELoss(LossModule):
         Returns:
             TensorDictBase: the entries named under ``Keys``.
         """
-        following = tensordict.get("next")
-        reward = following.get(self.tensor_keys.reward)
+        reward = tensordict["next"].get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten()
         partner = partners(reward.numel(), reward.device).squeeze(1)
 
-        embedding = outputs(self.encoder, self.encoder_params, tensordict)
+        embedding, next_embedding = embedded_ends(self, tensordict)
         predictions = outputs(self.ensemble, self.ensemble_params, tensordict)
         with torch.no_grad():
-            next_embedding = outputs(self.encoder, self.target_encoder_params, following)
-            ended = following.get(self.tensor_keys.terminated).reshape(-1, 1)
-            next_embedding = next_embedding.masked_fill(ended, 0.0)
             loc, scale = self._gaussian(tensordict, like=embedding)
             divergence = functional.gaussian_kl(loc, scale, loc[partner], scale[partner])
             variance = predictions.var(-1, correction=0)

@@ -38,35 +38,18 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
     Workers and learner form one process group of ``torch.distributed``; batches and weights travel
     through it. Its members are fixed, so a worker that is lost ends the run, with a message that
     names it; on machines that come and go use :class:`~torchrl_etl.collectors.ray.RayWorkers`.
-    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold.
-
-    Args:
-        create_env_fn (callable): builds a worker's environment. It is called once in the learner's
-            process as well, to learn what a batch looks like.
-        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
-            parameters reach the workers through :meth:`update_policy_weights_`.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold and for the
+    other arguments; ``create_env_fn`` is called once in the learner's process as well, to learn
+    what a batch looks like.
 
     Keyword Args:
-        num_workers (int): number of processes or jobs.
-        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
-            worker that it comes from.
-        total_frames (int): iteration ends there. Defaults to -1: no end.
-        sync (bool): one stacked batch of all workers instead of the first that is ready.
-            Defaults to ``False``.
-        seed (int): each worker gets its own seed from it. Defaults to 0.
-        timeout (float): most seconds to wait for the workers to start, for a batch, and for
-            a worker to take weights. Defaults to 300.
         launcher (str): ``"mp"`` starts processes on this machine, ``"submitit"`` jobs (on Slurm,
             described by ``slurm_kwargs``). Defaults to ``"mp"``.
         tcp_port (int, optional): where the workers meet. Defaults to a free port.
-        collector_class (type): class of the workers' collectors. Defaults to
-            :class:`~torchrl.collectors.Collector`.
-        collector_kwargs (mapping, optional): more arguments for it.
         **kwargs: see :class:`~torchrl.collectors.distributed.DistributedCollector`.
 
     Raises:
-        TypeError, ValueError: for bad arguments, before anything is started.
-        RuntimeError: if workers do not start in time, or one is lost.
+        ImportError: if a launcher is not installed.
 
     Examples:
         >>> from torchrl_etl.collectors.distributed import DistributedWorkers

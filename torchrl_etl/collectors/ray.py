@@ -36,30 +36,14 @@ class RayWorkers(RemoteWorkers, RayCollector):
     batches; every wait has a limit; a worker that is lost, or gives no answer in time, is
     replaced by one with the newest weights and a seed of its own, ``replacements`` times.
     The batch it had under way is never delivered, so no frame is counted twice.
-    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold.
-
-    Args:
-        create_env_fn (callable): builds a worker's environment.
-        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
-            parameters reach the workers through :meth:`update_policy_weights_`.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold and for the
+    other arguments; a replacement has to start and collect within ``timeout``.
 
     Keyword Args:
-        num_workers (int): number of Ray actors.
-        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
-            worker that it comes from.
-        total_frames (int): iteration ends there. Defaults to -1: no end.
-        sync (bool): one stacked batch of all workers instead of the first that is ready.
-            Defaults to ``False``.
-        seed (int): each worker, and each replacement, gets its own seed from it. Defaults to 0.
-        timeout (float): most seconds to wait for the workers to start, and for a batch.
-            A replacement has to start and collect in it. Defaults to 300.
         replacements (int): lost workers to replace before giving up. Defaults to 3.
         address (str, optional): Ray cluster to join: ``"auto"``, ``"host:port"`` or
             ``"ray://host:port"``. By default a local one is started, and ended by
             :meth:`shutdown`. Where Ray is running in this process already, it is used.
-        collector_class (type): class of the workers' collectors. Defaults to
-            :class:`~torchrl.collectors.Collector`.
-        collector_kwargs (mapping, optional): more arguments for it.
         ray_init_config (mapping, optional): more arguments for ``ray.init``.
         remote_configs (mapping, optional): what Ray reserves for a worker and where it is placed,
             as in ``ray.remote``. Defaults to ``{"num_cpus": 1}``; Ray gives a worker as many
@@ -68,8 +52,6 @@ class RayWorkers(RemoteWorkers, RayCollector):
 
     Raises:
         ImportError: if Ray is not installed.
-        TypeError, ValueError: for bad arguments, before anything is started.
-        RuntimeError: if workers do not start in time, or more are lost than may be replaced.
 
     Examples:
         >>> from torchrl_etl.collectors.ray import RayWorkers

@@ -47,6 +47,28 @@ class RemoteWorkers:
     ``("collector", "policy_version")`` the number of pushes when it was asked for.
 
     Subclasses are TorchRL collectors; they define how a worker is asked and how its answer comes.
+
+    Args:
+        create_env_fn (callable): builds a worker's environment.
+        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
+            parameters reach the workers through :meth:`update_policy_weights_`.
+
+    Keyword Args:
+        num_workers (int): number of workers.
+        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
+            worker that it comes from.
+        total_frames (int): iteration ends there. Defaults to -1: no end.
+        sync (bool): one stacked batch of all workers instead of the first that is ready.
+            Defaults to ``False``.
+        seed (int): each worker gets its own seed from it. Defaults to 0.
+        timeout (float): most seconds to wait for anything. Defaults to 300.
+        collector_class (type): class of the workers' collectors. Defaults to
+            :class:`~torchrl.collectors.Collector`.
+        collector_kwargs (mapping, optional): more arguments for it.
+
+    Raises:
+        TypeError, ValueError: for bad arguments, before anything is started.
+        RuntimeError: if workers do not start in time, or are lost.
     """
 
     policy: TensorDictModuleBase

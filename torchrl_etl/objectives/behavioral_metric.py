@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.objectives.checks import check_parts
-from torchrl_etl.objectives.pairs import outputs, partners
+from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners
 
 __all__ = ["BehavioralMetricLoss"]
 
@@ -196,18 +196,12 @@ class BehavioralMetricLoss(LossModule):
         Returns:
             TensorDictBase: the entries named under ``Keys``.
         """
-        following = tensordict.get("next")
-        reward = following.get(self.tensor_keys.reward)
+        reward = tensordict["next"].get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale
         partner = partners(reward.numel(), reward.device, self.pairs)
 
-        embedding = outputs(self.encoder, self.encoder_params, tensordict)
-        with torch.no_grad():
-            next_embedding = outputs(self.encoder, self.target_encoder_params, following)
-            ended = following.get(self.tensor_keys.terminated).reshape(-1, 1)
-            next_embedding = next_embedding.masked_fill(ended, 0.0)
-
+        embedding, next_embedding = embedded_ends(self, tensordict)
         out: dict[str, Tensor] = {}
         if self.divergence == "gaussian":
             loc, scale = self._predict(tensordict)

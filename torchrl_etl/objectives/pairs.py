@@ -8,10 +8,11 @@ import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.objectives import LossModule
 
 from torchrl_etl.draws import uniform_order
 
-__all__ = ["outputs", "partners"]
+__all__ = ["embedded_ends", "outputs", "partners"]
 
 
 def partners(
@@ -42,3 +43,18 @@ def outputs(
     with params.to_module(network, preserve_module_state=False):
         written = network(tensordict.select(*network.in_keys))
     return written.get(network.out_keys[0]).flatten(0, -2)
+
+
+def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Embeddings [samples, k] of both ends by a loss's encoder, the next by its target.
+
+    All terminated next states are one absorbing state, embedded at the origin.
+    """
+    embedding, following = (
+        outputs(loss.encoder, loss.encoder_params, tensordict),
+        tensordict["next"],
+    )
+    with torch.no_grad():
+        next_embedding = outputs(loss.encoder, loss.target_encoder_params, following)
+        ended = following.get(loss.tensor_keys.terminated).reshape(-1, 1)
+        return embedding, next_embedding.masked_fill(ended, 0.0)

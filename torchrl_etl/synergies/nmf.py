@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_etl.checks import check_integer
-from torchrl_etl.extras import extra
 from torchrl_etl.synergies.affine import AffineSynergies
+from torchrl_etl.synergies.factors import make_nmf, unfinished
 
 __all__ = ["NMFSynergies"]
 
@@ -56,21 +52,17 @@ class NMFSynergies(AffineSynergies):
         self.max_iter = max_iter
 
     def factorize(self, actions: np.ndarray) -> np.ndarray:
-        # Takes a second to import, which a worker that only decodes should not spend.
-        with extra("synergies"):
-            from sklearn.decomposition import NMF
-
-        self.model = NMF(self.num_synergies, init="nndsvda", max_iter=self.max_iter, random_state=0)
+        self.model = make_nmf(self.num_synergies, self.max_iter)
         above = self._above_low(actions)
         # Where no muscle ever moves there is nothing to divide, and it fails.
         above[0] += 1e-9 * (not above.any())
-        with _unfinished():
+        with unfinished():
             self.model.fit(above)
         return self.model.components_
 
     def coefficients(self, actions: Tensor) -> Tensor:
         rows = actions.detach().reshape(-1, len(self.low)).cpu().double().numpy()
-        with _unfinished():
+        with unfinished():
             found = torch.as_tensor(self.model.transform(self._above_low(rows)))
         return found.to(self.low).reshape(*actions.shape[:-1], self.num_synergies)
 
@@ -79,13 +71,3 @@ class NMFSynergies(AffineSynergies):
 
     def _above_low(self, actions: np.ndarray) -> np.ndarray:
         return (actions - self.low.cpu().double().numpy()).clip(min=0.0)
-
-
-@contextmanager
-def _unfinished() -> Iterator[None]:
-    """The last digits that more iterations would bring do not change a synergy."""
-    from sklearn.exceptions import ConvergenceWarning
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        yield

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_etl.extras import extra
 from torchrl_etl.modules.synergy_decoder import NEAREST
 from torchrl_etl.synergies.affine import AffineSynergies
+from torchrl_etl.synergies.factors import principal_components
 
 __all__ = ["PCASynergies"]
 
@@ -37,14 +37,8 @@ class PCASynergies(AffineSynergies):
     kind = "pca"
 
     def factorize(self, actions: np.ndarray) -> np.ndarray:
-        # Takes a second to import, which a worker that only decodes should not spend.
-        with extra("synergies"):
-            from sklearn.decomposition import PCA
-
         before = self._before_bounds(torch.as_tensor(actions)).numpy()
-        # It divides by the total variance on its way, which constant actions do not have.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found = PCA(self.num_synergies, svd_solver="covariance_eigh").fit(before)
+        found = principal_components(before, self.num_synergies, svd_solver="covariance_eigh")
         self.mean = torch.as_tensor(found.mean_).to(self.low)
         return found.components_
 

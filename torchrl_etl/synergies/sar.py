@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_etl.checks import check_integer
-from torchrl_etl.extras import extra
 from torchrl_etl.synergies.affine import AffineSynergies
+from torchrl_etl.synergies.factors import principal_components, unfinished
 
 __all__ = ["SARSynergies", "independent_components"]
 
@@ -91,22 +89,15 @@ def independent_components(
         seed (int): of the search. Default: 0.
         max_iter (int): of its iterations at most. Default: 1000.
     """
-    # Takes a second to import, which a worker that only decodes should not spend.
-    with extra("synergies"):
-        from sklearn.decomposition import PCA, FastICA
-        from sklearn.exceptions import ConvergenceWarning
-
-    # It divides by the total variance on its way, which constant actions do not have.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        pca = PCA(count, random_state=seed).fit(actions)
+    pca = principal_components(actions, count, random_state=seed)
     basis, mean = pca.components_.copy(), pca.mean_
     found = pca.explained_variance_
     varying = int((found > 1e-10 * max(found.max(), 1e-10)).sum())
     if varying > 1:
+        from sklearn.decomposition import FastICA
+
         ica = FastICA(whiten="unit-variance", max_iter=max_iter, random_state=seed)
-        with warnings.catch_warnings():
-            # Among components that are alike in shape, as Gaussian ones, any turn is as good.
-            warnings.simplefilter("ignore", ConvergenceWarning)
+        with unfinished():  # among components alike in shape, as Gaussian ones, any turn is as good
             ica.fit(pca.transform(actions)[:, :varying])
         mean = mean + ica.mean_ @ basis[:varying]
         basis[:varying] = ica.mixing_.T @ basis[:varying]

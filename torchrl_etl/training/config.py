@@ -74,28 +74,15 @@ PRESETS = {
 }
 """Groups of presets, with what stands for none of them, now and before."""
 
+_OF_A_STAGE = ("frames", "batch_size", "replay_ratio", "learning_starts")
+_OF_A_STAGE += ("buffer_size", "buffer_storage")
+
 MAY_CHANGE = (
-    *(
-        "frames",
-        "stage",
-        "restart_seed",
-        "device",
-        "threads",
-        "compile",
-        "log",
-        "logger_kwargs",
-        "log_every",
-    ),
-    *("progress", "pictures", "vaf_curve", "evaluation", "checkpoint", "ray", "distributed"),
+    *("frames", "stage", "restart_seed", "device", "threads", "compile"),
+    *("log", "logger_kwargs", "log_every", "progress", "pictures", "vaf_curve"),
+    *("evaluation", "checkpoint", "ray", "distributed"),
     *(f"collector.{key}" for key in ("kind", "ahead", "timeout", "num_workers")),
-    *(
-        f"{stage}.{key}"
-        for stage in ("explore", "learn")
-        for key in (
-            *("frames", "batch_size", "replay_ratio", "learning_starts"),
-            *("buffer_size", "buffer_storage"),
-        )
-    ),
+    *(f"{stage}.{key}" for stage in ("explore", "learn") for key in _OF_A_STAGE),
     *("learn.sac.lr", "learn.sac.lr_end", "learn.decoder.lr", "explore.sac.lr"),
     "explore.fit.final_updates",
 )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +14,14 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_etl.analysis import Interval, interval, success_interval
 from torchrl_etl.envs import episode_length, resolve_task
 
-__all__ = ["EVALUATION_SEED", "Evaluation", "evaluate", "evaluate_task", "longest_episode"]
+__all__ = [
+    "EVALUATION_SEED",
+    "Evaluation",
+    "as_evaluated",
+    "evaluate",
+    "evaluate_task",
+    "longest_episode",
+]
 
 EVALUATION_SEED = 10_000_000
 """Seed of the first evaluation episode; training seeds start at 2**30."""
@@ -98,12 +106,7 @@ def evaluate(
         Evaluation: solved is None where the environment does not define it.
     """
     returns, lengths, solved, successes = [], [], [], []
-    devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
-    with (
-        torch.random.fork_rng(devices),
-        torch.no_grad(),
-        set_exploration_type(ExplorationType.DETERMINISTIC),
-    ):
+    with as_evaluated(env):
         for episode in range(episodes):
             torch.manual_seed(seed + episode)
             env.set_seed(seed + episode)
@@ -116,6 +119,18 @@ def evaluate(
                 enough = solved_steps is not None and solved[-1] >= solved_steps
                 successes.append(flags[-1].item() if solved_steps is None else enough)
     return Evaluation(returns, lengths, solved or None, max_steps, successes or None)
+
+
+@contextmanager
+def as_evaluated(env: EnvBase) -> Iterator[None]:
+    """A policy acts without noise, and training finds its random numbers as they were."""
+    devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
+    with (
+        torch.random.fork_rng(devices),
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+    ):
+        yield
 
 
 def evaluate_task(

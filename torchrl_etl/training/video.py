@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase
 
 from torchrl_etl.analysis.moving_pictures import CAPTION_HEIGHT, FPS, grid_shape
 from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, middle_and_size, planes, scenery
 from torchrl_etl.checks import check_integer
 from torchrl_etl.envs import has_free_root, mujoco_state
 from torchrl_etl.extras import extra
-from torchrl_etl.training.evaluation import EVALUATION_SEED
+from torchrl_etl.training.evaluation import EVALUATION_SEED, as_evaluated
 
 __all__ = ["EpisodeRecorder", "check_video_size"]
 
@@ -146,13 +146,7 @@ class EpisodeRecorder:
         Keyword Args:
             seed (int): of the first; see :func:`~torchrl_etl.training.evaluate`.
         """
-        device = self._env.device
-        devices = [device] if device is not None and device.type == "cuda" else []
-        with (
-            torch.random.fork_rng(devices),
-            torch.no_grad(),
-            set_exploration_type(ExplorationType.DETERMINISTIC),
-        ):
+        with as_evaluated(self._env):
             return [self._episode(policy, seed + number) for number in range(episodes)]
 
     def _episode(self, policy: TensorDictModuleBase, seed: int) -> np.ndarray:
