@@ -19,6 +19,7 @@ import numpy as np
 
 from torchrl_etl.command_line import one_sentence
 from torchrl_etl.envs import make_env
+from torchrl_etl.envs.joint_torques import active_torques
 from torchrl_etl.envs.simulator import mujoco_state, simulator
 
 
@@ -48,14 +49,7 @@ def torques(env, parts):
         raise ValueError(f"No joint's name contains any of {parts}; there are {names}.")
     data = mujoco.MjData(model)
     data.qpos[:] = getattr(simulator(env), "target_jnt_value", now.qpos)
-    forces = []
-    for activation in (np.zeros(model.na), *np.eye(model.na)):
-        data.act[:] = activation
-        mujoco.mj_forward(model, data)
-        forces.append(data.qfrc_actuator.copy())
-    active = np.array(forces[1:]) - forces[0]  # less the passive forces of stretched muscles
-    for joint in joints:
-        torque = active[:, model.jnt_dofadr[joint]]
+    for joint, torque in zip(joints, active_torques(model, data, joints), strict=True):
         for muscle in np.argsort(-np.abs(torque)):
             if abs(torque[muscle]) > 1e-3:
                 yield {

@@ -14,11 +14,7 @@ from torchrl.data import Bounded
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from tests import test_objectives_sac as plain
-from torchrl_etl.baselines.lattice import (
-    LatticeNormal,
-    StateDependentSpread,
-    make_lattice_actor,
-)
+from torchrl_etl.baselines.lattice import LatticeNormal, StateDependentSpread, make_lattice_actor
 from torchrl_etl.modules import make_actor
 from torchrl_etl.objectives import LeanSACLoss
 

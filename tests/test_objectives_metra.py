@@ -114,8 +114,8 @@ def test_embeddings_gain_nothing_by_more_room_than_epsilon() -> None:
     loss(transitions(*SHORT, DIRECTION, 3))["loss_representation"].backward()
     gradient = next(loss.encoder_params.parameters()).grad
     # Row 2 minus row 1 along the direction, and no pull to make the step shorter.
-    torch.testing.assert_close(gradient[:, 2], -torch.tensor(DIRECTION[0]))
-    torch.testing.assert_close(gradient[:, 1], torch.tensor(DIRECTION[0]))
+    torch.testing.assert_close(gradient[2], -torch.tensor(DIRECTION[0]))
+    torch.testing.assert_close(gradient[1], torch.tensor(DIRECTION[0]))
 
 
 @pytest.mark.parametrize(
@@ -140,8 +140,8 @@ def test_steps_on_a_chain_come_to_the_bound(norm: str, lambda_init: float, lengt
     assert out["mean_step"].item() == pytest.approx(length, rel=0.05)
     assert out["mean_bonus"].item() == pytest.approx(length, rel=0.05)
     # Ends of the chain are as far apart as there are steps between them.
-    weight = next(loss.encoder_params.parameters())
-    apart = (weight[:, -1] - weight[:, 0]).norm().item()
+    rows = next(loss.encoder_params.parameters())
+    apart = (rows[-1] - rows[0]).norm().item()
     assert apart == pytest.approx((states - 1) * length, rel=0.05)
 
 

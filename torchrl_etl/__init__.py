@@ -14,12 +14,7 @@ if TYPE_CHECKING:
     from torchrl_etl.modules import GMVAE, SynergyDecoder
     from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
     from torchrl_etl.synergies import fit_gmvae, fit_synergies, load_bundle, save_bundle
-    from torchrl_etl.transforms import (
-        DirectionPrimer,
-        IntrinsicReward,
-        LatentAction,
-        SynergyAction,
-    )
+    from torchrl_etl.transforms import DirectionPrimer, IntrinsicReward, LatentAction, SynergyAction
 
 __version__ = "0.1.0"
 

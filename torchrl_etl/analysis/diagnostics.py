@@ -15,12 +15,7 @@ from torchrl_etl.checks import check_integer
 if TYPE_CHECKING:
     from torchrl_etl.modules import SynergyDecoder
 
-__all__ = [
-    "control_authority",
-    "direction_alignment",
-    "synergy_effects",
-    "synergy_warnings",
-]
+__all__ = ["control_authority", "direction_alignment", "synergy_effects", "synergy_warnings"]
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from torchrl_etl.analysis.diagnostics import synergy_effects
 from torchrl_etl.analysis.state_space import embedding
 from torchrl_etl.analysis.statistics import interval
 from torchrl_etl.modules import SynergyDecoder
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["embedding", "learning_curves", "synergy_heatmap", "vaf_curve"]
 
@@ -88,7 +85,10 @@ def learning_curves(
         tidy(axes)
         for index, name in enumerate(rows):
             if name in curves[column]:
-                _draw_series(axes, *curves[column][name], name, index)
+                frames, mean, low, high = curves[column][name]
+                look = _look(index) | {"markevery": max(1, len(frames) // 12)}
+                axes.plot(frames, mean, label=name or None, **look)
+                axes.fill_between(frames, low, high, color=look["color"], alpha=0.2, linewidth=0)
         if explore_frames:
             axes.axvspan(0, explore_frames, color="0.93", zorder=0, label="explore stage")
         axes.set_xlim(left=0)
@@ -235,26 +235,7 @@ def vaf_curve(
 
 def _look(index: int) -> dict[str, Any]:
     index %= len(SERIES)
-    return {
-        "color": SERIES[index],
-        "marker": MARKERS[index],
-        "markersize": 5,
-        "linewidth": 1.8,
-    }
-
-
-def _draw_series(
-    axes: Axes,
-    frames: np.ndarray,
-    mean: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    name: str,
-    index: int,
-) -> None:
-    look = _look(index) | {"markevery": max(1, len(frames) // 12)}
-    axes.plot(frames, mean, label=name or None, **look)
-    axes.fill_between(frames, low, high, color=look["color"], alpha=0.2, linewidth=0)
+    return {"color": SERIES[index], "marker": MARKERS[index], "markersize": 5, "linewidth": 1.8}
 
 
 def _read(source: Rows | str | os.PathLike[str]) -> Rows:

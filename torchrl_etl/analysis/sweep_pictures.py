@@ -16,12 +16,7 @@ import numpy as np
 
 from torchrl_etl.analysis.bootstrap import mean_band
 from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figure, tidy, write
-from torchrl_etl.analysis.published import (
-    PublishedCurve,
-    caveats,
-    environment_id,
-    published_curves,
-)
+from torchrl_etl.analysis.published import PublishedCurve, caveats, environment_id, published_curves
 from torchrl_etl.analysis.sweep_results import SweepRun
 from torchrl_etl.analysis.sweep_statistics import OverallResult
 

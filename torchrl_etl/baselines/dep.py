@@ -127,7 +127,8 @@ class DEPController:
             Tensor: commands y [rows, n] in [-1, 1].
         """
         self._sense(lengths)
-        drive = _unit(torch.einsum("rij,rj->ri", self.weights(), self.sensed))
+        drive = torch.einsum("rij,rj->ri", self.weights(), self.sensed)
+        drive = drive / (drive.norm(dim=-1, keepdim=True) + _TINY)
         worn = (self.bias_rate * self.command).clamp(-_BIAS_STEP, _BIAS_STEP)
         self.bias = self.bias - worn - _BIAS_DECAY * self.bias
         self.command = torch.tanh(self.kappa * drive + self.bias)
@@ -156,10 +157,6 @@ class DEPController:
         # Rows of C and of C Mᵀ have the same length, as M = -I.
         length = matrix.norm(dim=-1, keepdim=True) + _TINY
         return self.kappa * matrix / (length if self.normalize == "rows" else length.mT)
-
-
-def _unit(vector: Tensor) -> Tensor:
-    return vector / (vector.norm(dim=-1, keepdim=True) + _TINY)
 
 
 class DEPExploration(TensorDictModuleBase):

@@ -14,10 +14,7 @@ from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 
 from torchrl_etl.collectors.vector import VectorCollector
-from torchrl_etl.collectors.worker_process import (
-    live_as_long_as_the_learner,
-    stop_signals_blocked,
-)
+from torchrl_etl.collectors.worker_process import live_as_long_as_the_learner, stop_signals_blocked
 
 __all__ = ["AsyncProcessWorkers", "ProcessWorkers"]
 
@@ -49,9 +46,7 @@ class _OwnWeights:
             )
 
     def update_policy_weights_(
-        self,
-        policy_or_weights: TensorDictBase | nn.Module | None = None,
-        **kwargs: Any,
+        self, policy_or_weights: TensorDictBase | nn.Module | None = None, **kwargs: Any
     ) -> None:
         """Gives the workers weights: by default, those that the learner's policy has now."""
         super().update_policy_weights_(

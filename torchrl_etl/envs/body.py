@@ -35,11 +35,7 @@ def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
     moments = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
-        moments,
-        data.actuator_moment,
-        data.moment_rownnz,
-        data.moment_rowadr,
-        data.moment_colind,
+        moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
     )
     trees = np.unique(model.dof_treeid[moments.any(0)])
     return np.isin(model.dof_treeid[model.jnt_dofadr], trees)

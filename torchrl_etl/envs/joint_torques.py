@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.envs.simulator import mujoco_state, simulator
 
-__all__ = ["JointTorques", "excitation", "joint_torques"]
+__all__ = ["JointTorques", "active_torques", "excitation", "joint_torques"]
 
 
 class JointTorques(NamedTuple):
@@ -70,7 +70,7 @@ def joint_torques(
             places = model.jnt_qposadr[limited]
             moved = data.qpos[places] + span * generator.uniform(-0.5, 0.5, len(limited))
             data.qpos[places] = moved.clip(*model.jnt_range[limited].T)
-        total[simple] += _tied(model, data) @ _active_torques(model, data, simple)
+        total[simple] += _tied(model, data) @ active_torques(model, data, simple)
     mean = total / num_postures
     moved = np.abs(mean).max(1) > 1e-6 * np.abs(mean).max()
     names = tuple(model.joint(int(joint)).name for joint in np.flatnonzero(moved))
@@ -94,8 +94,8 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
     return action
 
 
-def _active_torques(model: Any, data: Any, simple: np.ndarray) -> np.ndarray:
-    """Of each muscle alone on each hinge or slide in one posture [J, n], less what is passive."""
+def active_torques(model: Any, data: Any, joints: np.ndarray) -> np.ndarray:
+    """Of each muscle alone on hinges or slides in one posture [J, n], less what is passive."""
     import mujoco
 
     torques = []
@@ -103,7 +103,7 @@ def _active_torques(model: Any, data: Any, simple: np.ndarray) -> np.ndarray:
     for activation in (np.zeros(model.na), *np.eye(model.na)):
         data.act[model.actuator_actadr] = activation
         mujoco.mj_forward(model, data)
-        torques.append(data.qfrc_actuator[model.jnt_dofadr[simple]].copy())
+        torques.append(data.qfrc_actuator[model.jnt_dofadr[joints]].copy())
     return (np.array(torques[1:]) - torques[0]).T
 
 

@@ -69,10 +69,7 @@ class Explorer:
             return {"terms": terms, "reward": self.exploration.reward}
 
         learner = context.learner(
-            "explore",
-            inputs=self.exploration.inputs,
-            wrap=self.exploration.behavior,
-            more=more,
+            "explore", inputs=self.exploration.inputs, wrap=self.exploration.behavior, more=more
         )
         env_options = {"activations": True} if fit["actions"] == "activation" else {}
         self.stage = context.stage(

@@ -13,13 +13,7 @@ from torch.distributions import Distribution
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_etl.checks import (
-    check_choice,
-    check_flag,
-    check_integer,
-    check_real,
-    check_sizes,
-)
+from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
 
 __all__ = ["Body", "actor_with", "make_actor", "make_critic", "make_layers", "start_small"]
 

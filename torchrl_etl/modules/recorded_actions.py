@@ -17,11 +17,7 @@ OVERSHOOT = 0.1
 
 
 def as_actions(
-    actions: Tensor | np.ndarray | Sequence[Any],
-    *,
-    low: Tensor,
-    high: Tensor,
-    min_rows: int = 0,
+    actions: Tensor | np.ndarray | Sequence[Any], *, low: Tensor, high: Tensor, min_rows: int = 0
 ) -> Tensor:
     """Recorded actions as a tensor of the dtype and on the device of the bounds.
 

@@ -73,10 +73,7 @@ class DecoderLoss(LossModule):
     target_decoder_params: TensorDictParams
 
     def __init__(
-        self,
-        decoder: TensorDictModuleBase,
-        *,
-        reduction: Literal["mean", "sum", "none"] = "mean",
+        self, decoder: TensorDictModuleBase, *, reduction: Literal["mean", "sum", "none"] = "mean"
     ) -> None:
         check_choice("reduction", reduction, ("mean", "sum", "none"))
         check_parts("decoder", decoder, TensorDictModuleBase, outputs=1)

@@ -20,11 +20,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.draws import standard_normal
-from torchrl_etl.functional import (
-    categorical_cross_entropy,
-    categorical_mean,
-    project_categorical,
-)
+from torchrl_etl.functional import categorical_cross_entropy, categorical_mean, project_categorical
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["LeanSACLoss", "call"]

@@ -6,10 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 

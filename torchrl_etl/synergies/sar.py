@@ -45,13 +45,7 @@ class SARSynergies(AffineSynergies):
     kind = "sar"
 
     def __init__(
-        self,
-        low: Tensor,
-        high: Tensor,
-        num_synergies: int,
-        *,
-        max_iter: int = 1000,
-        seed: int = 0,
+        self, low: Tensor, high: Tensor, num_synergies: int, *, max_iter: int = 1000, seed: int = 0
     ) -> None:
         check_integer(1, max_iter=max_iter)
         check_integer(0, seed=seed)

@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchrl_etl.checks import (
-    check_choice,
-    check_flag,
-    check_integer,
-    check_real,
-    check_sizes,
-)
+from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.extras import extra

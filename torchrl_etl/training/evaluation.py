@@ -62,11 +62,7 @@ class Evaluation(NamedTuple):
 
     def intervals(self) -> dict[str, Interval]:
         """By name, those that the environment defines."""
-        named = {
-            "return": self.mean_return,
-            "solved": self.solved,
-            "solved_time": self.solved_time,
-        }
+        named = {"return": self.mean_return, "solved": self.solved, "solved_time": self.solved_time}
         return {name: value for name, value in named.items() if value is not None}
 
     def summary(self) -> dict[str, object]:

@@ -10,6 +10,7 @@ import platform
 import subprocess
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -223,20 +224,13 @@ class _ResumableTensorboard(TensorboardLogger):
 
 def facts() -> dict[str, Any]:
     """Versions, commit and machine class: what a number must carry to be believed."""
-    return {
-        "torchrl_etl": version("torchrl_etl"),
-        "commit": _commit(),
-        "python": platform.python_version(),
-        **{name: version(name) for name in _PACKAGES if _is_installed(name)},
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-    }
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        return bool(version(package))
-    except PackageNotFoundError:
-        return False
+    found = {"torchrl_etl": version("torchrl_etl"), "commit": _commit()}
+    found["python"] = platform.python_version()
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return {**found, "machine": machine}
 
 
 def _commit() -> str | None:

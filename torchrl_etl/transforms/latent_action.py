@@ -107,8 +107,10 @@ class LatentAction(ModuleTransform):
         self.executed_key = unravel_key(executed_key)
         self.action_key = unravel_key(module.out_keys[0] if action_key is None else action_key)
         if decoded_key is None:
-            taken = self.action_key == self.latent_key
-            decoded_key = _beside(self.action_key, "decoded_action") if taken else self.action_key
+            decoded_key = self.action_key
+            if self.action_key == self.latent_key:
+                path = (decoded_key,) if isinstance(decoded_key, str) else decoded_key
+                decoded_key = (*path[:-1], "decoded_action")
         self.decoded_key = unravel_key(decoded_key)
         if self.executed_key in (self.latent_key, self.action_key):
             raise ValueError(
@@ -293,10 +295,6 @@ def _without(spec: Composite, key: NestedKey) -> Composite:
         key = unravel_key(key[:-1])
         del spec[key]
     return spec
-
-
-def _beside(key: NestedKey, name: str) -> NestedKey:
-    return name if isinstance(key, str) else unravel_key((*key[:-1], name))
 
 
 def _refuse_replay_buffer(name: str) -> None:
