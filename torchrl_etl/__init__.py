@@ -7,7 +7,7 @@ imported when it is asked for, since TorchRL takes seconds.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from torchrl_etl.gl_backend import ignore_missing_library
+from torchrl_etl.gl_backend import ignore_unusable_backend
 
 if TYPE_CHECKING:
     from torchrl_etl.envs import make_env
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-ignore_missing_library()  # before TorchRL imports MuJoCo
+ignore_unusable_backend()  # before TorchRL imports MuJoCo
 
 _HOMES = {
     "envs": ("make_env",),

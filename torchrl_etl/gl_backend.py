@@ -8,29 +8,32 @@ import subprocess
 import sys
 import warnings
 
-__all__ = ["draw_without_display", "ignore_missing_library"]
+__all__ = ["draw_without_display", "ignore_unusable_backend"]
 
 _TRY = "import mujoco; mujoco.GLContext(16, 16).make_current()"
 _LIBRARIES = {"egl": ("libEGL", "libegl1"), "osmesa": ("libOSMesa", "libosmesa6")}
+_ON, _OFF = ("enable", "enabled", "on", "true", "1"), ("disable", "disabled", "off", "false", "0")
+_TAKEN = ("", "glfw", "glx", *_ON, *_OFF)
+"""What MuJoCo takes besides on Linux; none of it needs a library when it is imported."""
 
 
-def ignore_missing_library() -> None:
-    """Warn and forget a ``MUJOCO_GL`` whose library is missing, naming the package to install.
+def ignore_unusable_backend() -> None:
+    """Warn and forget a ``MUJOCO_GL`` that is no back end, or whose library is missing.
 
-    MuJoCo opens that library when it is imported, and so nothing would run, whether it draws or
-    not.
+    MuJoCo reads it and opens that library when it is imported, and so nothing would run, whether it
+    draws or not. The warning names the package to install, or what can be named instead.
     """
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if sys.platform != "linux" or backend not in _LIBRARIES:
+    if sys.platform != "linux" or backend in _TAKEN:
         return
-    library, package = _LIBRARIES[backend]
-    if not any(map(_opens, (f"{library}.so", *(f"{library}.so.{i}" for i in range(10))))):
-        warnings.warn(
-            f"MUJOCO_GL={backend} is ignored, since {library} is not installed (Debian: apt-get "
-            f"install {package}).",
-            stacklevel=2,
-        )
-        del os.environ["MUJOCO_GL"]
+    fault = "it is no back end of MuJoCo; name egl, osmesa or glfw, or leave it unset"
+    if backend in _LIBRARIES:
+        library, package = _LIBRARIES[backend]
+        if any(map(_opens, (f"{library}.so", *(f"{library}.so.{i}" for i in range(10))))):
+            return
+        fault = f"{library} is not installed (Debian: apt-get install {package})"
+    warnings.warn(f"MUJOCO_GL={backend} is ignored, since {fault}.", stacklevel=2)
+    del os.environ["MUJOCO_GL"]
 
 
 def draw_without_display() -> None:
