@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import os
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +14,18 @@ from types import ModuleType
 from pytest import MonkeyPatch
 
 from tests.configs import ROOT
+
+
+def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
+    """Run ``recipes/RECIPE`` in a process and a folder of its own."""
+    return subprocess.run(
+        [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=240,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
 
 
 def command(recipe: str, *arguments: str) -> int:

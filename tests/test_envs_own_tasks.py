@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
 import torch
 
-from tests.commands import command
-from tests.configs import ROOT, TINY
+from tests.commands import command, process
+from tests.configs import TINY
 from torchrl_etl.envs import actuator_names, make_env, resolve_task
 
 SMALL = [*(setting for setting in TINY if not setting.startswith("env=")), "method=sac"]
@@ -51,17 +48,6 @@ def own(tmp_path, monkeypatch) -> str:
     yield f"{module}:{env_id}"
     gym.registry.pop(env_id, None)
     sys.modules.pop(module, None)
-
-
-def process(name: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "recipes" / name), *overrides],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=240,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
 
 
 def test_a_module_in_the_current_folder_registers_its_task(own):

@@ -17,23 +17,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.commands import command
+from tests.commands import command, process
 from tests.configs import ROOT, TINY
 from torchrl_etl.command_line import print_intervals, quote_paths
 from torchrl_etl.synergies import load_bundle, save_bundle
 
 SMALL = [override for override in TINY if not override.startswith("env=")]
-
-
-def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=240,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ be given the numbers that its own generator would have drawn for it alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,7 +50,8 @@ def uniform_order(count: int, device: torch.device) -> Tensor:
     return _next(partial(torch.randperm, count, device=device))
 
 
-class given_draws(AbstractContextManager):
+@contextmanager
+def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
     """What is drawn within is taken from ``tensors``, one after another.
 
     Raises:
@@ -62,18 +62,15 @@ class given_draws(AbstractContextManager):
         ...     standard_normal(torch.zeros(2))
         tensor([1., 1.])
     """
-
-    def __init__(self, tensors: Iterable[Tensor]) -> None:
-        self.tensors = list(tensors)
-
-    def __enter__(self) -> None:
-        _source.given = self.tensors
-
-    def __exit__(self, *error: Any) -> None:
+    _source.given = list(tensors)
+    try:
+        yield
+    finally:
         _source.given = None
 
 
-class recorded_draws(AbstractContextManager):
+@contextmanager
+def recorded_draws() -> Iterator[list[Draw]]:
     """Remembers what is drawn within, in a list of functions that draw the like again.
 
     Examples:
@@ -82,12 +79,10 @@ class recorded_draws(AbstractContextManager):
         >>> [draw().shape for draw in draws]
         [torch.Size([2, 3])]
     """
-
-    def __enter__(self) -> list[Draw]:
-        _source.recorded = []
-        return _source.recorded
-
-    def __exit__(self, *error: Any) -> None:
+    _source.recorded = []
+    try:
+        yield _source.recorded
+    finally:
         _source.recorded = None
 
 

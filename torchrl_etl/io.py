@@ -6,7 +6,6 @@ A crash in the middle of a replacement leaves the old files or the new ones.
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 from collections.abc import Collection, Mapping
@@ -184,15 +183,8 @@ def as_json(content: Any) -> str:
         >>> as_json({"low": float("nan")})
         '{\\n  "low": null\\n}\\n'
     """
-    return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
+    finite = json.loads(json.dumps(content), parse_constant=lambda name: None)
+    return json.dumps(finite, indent=2) + "\n"
 
 
 def flush_folder(folder: Path) -> None:

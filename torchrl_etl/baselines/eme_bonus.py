@@ -23,15 +23,10 @@ __all__ = ["EMEBonus"]
 class EMEBonus(TransitionReward):
     """Rewards steps that are long in EME's metric, more so where the reward is not yet known.
 
-    The same class works in three places: on an env, where every step writes the bonus; on a replay
-    buffer, where every *sampled* batch gets the bonus of the current networks and nothing is
-    written when the buffer is extended; and called on a tensordict with root and ``"next"``
-    entries, any batch size, time included.
-
-    Both networks are held by reference and belong to whoever trains them
-    (:class:`~torchrl_etl.baselines.eme.EMELoss`): the transform evaluates them without gradients
-    on their own device and saves none of them. In another process they are the copies made when
-    the worker started.
+    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer,
+    where every *sampled* batch gets the bonus of the networks as they are by then, and on a
+    tensordict, and holds both networks by reference: they belong to whoever trains them
+    (:class:`~torchrl_etl.baselines.eme.EMELoss`).
 
     Equation: ``b = d(s, s') min(max(Var_k r̂_k(s, a), 1), M)``, and ``r + weight b`` for the
     learner; with ``normalize``, ``r + weight σ_r b / σ_b`` with running standard deviations.

@@ -5,24 +5,19 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TransformAction
 
-__all__ = ["FlatAction", "check_action_space"]
+__all__ = ["check_action_space", "flat_action"]
 
 _LARGEST_BOUND = 1e6
 """Bounds beyond are no bounds: MuJoCo and DMControl write 1e10 for a motor without limits."""
 
 
-class FlatAction(gym.ActionWrapper):
-    """Takes an action of any shape as one flat array of actuators."""
-
-    def __init__(self, env: gym.Env):
-        super().__init__(env)
-        box = env.action_space
-        self.action_space = spaces.Box(box.low.ravel(), box.high.ravel(), dtype=box.dtype.type)
-        self._shape = box.shape
-
-    def action(self, action: np.ndarray) -> np.ndarray:
-        return np.reshape(action, self._shape)
+def flat_action(env: gym.Env) -> gym.Env:
+    """The environment with an action of any shape as one flat array of actuators."""
+    box = env.action_space
+    flat = spaces.Box(box.low.ravel(), box.high.ravel(), dtype=box.dtype.type)
+    return TransformAction(env, lambda action: np.reshape(action, box.shape), flat)
 
 
 def check_action_space(space: spaces.Space, task: str) -> None:

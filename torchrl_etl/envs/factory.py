@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper
 
 from torchrl_etl.checks import check_integer
-from torchrl_etl.envs.action_space import FlatAction, check_action_space
+from torchrl_etl.envs.action_space import check_action_space, flat_action
 from torchrl_etl.envs.arguments import argument_errors, check_known
 from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
@@ -251,7 +251,7 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
     except ValueError:
         env.close()
         raise
-    return env if len(env.action_space.shape) == 1 else FlatAction(env), faults
+    return env if len(env.action_space.shape) == 1 else flat_action(env), faults
 
 
 def _success_key(task: Task, env_kwargs: Mapping[str, Any] | None) -> str | None:

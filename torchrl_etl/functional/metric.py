@@ -56,8 +56,7 @@ def l2_distance(x: Tensor, y: Tensor, eps: float = EPS) -> Tensor:
     r"""Euclidean distance :math:`d` between embeddings, differentiable where they coincide.
 
     Args:
-        x (Tensor): embeddings, ``[*, k]``.
-        y (Tensor): embeddings, ``[*, k]``.
+        x, y (Tensor): embeddings, ``[*, k]``.
         eps (float, optional): added inside the root, so that the gradient at ``x == y`` is zero
             and not NaN; the distance there reads ``eps ** 0.5``. Defaults to ``1e-12``.
 
@@ -85,8 +84,7 @@ def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> 
     not zero either.
 
     Args:
-        x (Tensor): embeddings, ``[*, k]``.
-        y (Tensor): embeddings, ``[*, k]``.
+        x, y (Tensor): embeddings, ``[*, k]``.
         beta (float, optional): weight of the angle (radians). Defaults to ``0.1``.
         eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
 
@@ -117,10 +115,8 @@ def gaussian_w2(
     .. math:: W_2 = \sqrt{\|\mu_i - \mu_j\|^2 + \|\sigma_i - \sigma_j\|^2}
 
     Args:
-        mean_i (Tensor): mean of the first, ``[*, k]``.
-        std_i (Tensor): standard deviation of the first, ``[*, k]``.
-        mean_j (Tensor): mean of the second, ``[*, k]``.
-        std_j (Tensor): standard deviation of the second, ``[*, k]``.
+        mean_i, std_i (Tensor): mean and standard deviation of the first, ``[*, k]``.
+        mean_j, std_j (Tensor): those of the second, ``[*, k]``.
         eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
 
     Returns:
@@ -145,8 +141,7 @@ def metric_target(reward_i: Tensor, reward_j: Tensor, divergence: Tensor, gamma:
     .. math:: \mathcal F^\pi(d)(s_i, s_j) = |r_i - r_j| + \gamma\,\mathcal D(d; P_i, P_j)
 
     Args:
-        reward_i (Tensor): rewards of the first states, ``[*]``.
-        reward_j (Tensor): rewards of the second states, ``[*]``.
+        reward_i, reward_j (Tensor): rewards of the first and of the second states, ``[*]``.
         divergence (Tensor): distance between what follows, ``[*]``. A loss passes it detached.
         gamma (float): discount factor.
 
@@ -232,10 +227,8 @@ def discriminability(
     - ``"literal"``: :math:`1[|r_i-r_j|<\epsilon]\;\|\phi_i-\phi_j\|^2`
 
     Args:
-        reward_i (Tensor): rewards of the first states, ``[*]``.
-        reward_j (Tensor): rewards of the second states, ``[*]``.
-        embedding_i (Tensor): embeddings of the first states, ``[*, k]``.
-        embedding_j (Tensor): embeddings of the second states, ``[*, k]``.
+        reward_i, reward_j (Tensor): rewards of the first and of the second states, ``[*]``.
+        embedding_i, embedding_j (Tensor): their embeddings, ``[*, k]``.
         epsilon (float): pairs whose rewards differ by less than this are regularized.
         margin (float, optional): distance beyond which the hinge is silent; not read by
             ``"literal"``. Defaults to ``1.0``.

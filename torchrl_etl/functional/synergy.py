@@ -45,10 +45,8 @@ def gaussian_kl(loc_q: Tensor, scale_q: Tensor, loc_p: Tensor, scale_p: Tensor) 
     r"""Closed-form :math:`\mathrm{KL}(q \| p)` of diagonal Gaussians, summed over dimensions.
 
     Args:
-        loc_q (Tensor): means of ``q``, ``[*, d]``.
-        scale_q (Tensor): standard deviations of ``q``, ``[*, d]``.
-        loc_p (Tensor): means of ``p``, broadcastable to ``[*, d]``.
-        scale_p (Tensor): standard deviations of ``p``, broadcastable to ``[*, d]``.
+        loc_q, scale_q (Tensor): means and standard deviations of ``q``, ``[*, d]``.
+        loc_p, scale_p (Tensor): those of ``p``, broadcastable to ``[*, d]``.
 
     Returns:
         Tensor: divergences in nats, ``[*]``.
@@ -98,8 +96,7 @@ def mixture_log_prob(z: Tensor, loc: Tensor, scale: Tensor, logits: Tensor | Non
 
     Args:
         z (Tensor): synergy coefficients, ``[*, d]``.
-        loc (Tensor): component means, ``[C, d]``.
-        scale (Tensor): component standard deviations, ``[C, d]``.
+        loc, scale (Tensor): means and standard deviations of the components, ``[C, d]``.
         logits (Tensor, optional): logits of :math:`P`, ``[C]``. ``None`` is the fixed uniform
             prior of the paper. Defaults to ``None``.
 
@@ -162,8 +159,7 @@ def gmvae_bound(
         likelihood_scale (Tensor): standard deviation of :math:`p(a|z)`, broadcastable to
             ``[*, C, n]``.
         logits (Tensor): logits of :math:`q(c|a)`, ``[*, C]``.
-        loc (Tensor): means of :math:`q(z|a,c)`, ``[*, C, d]``.
-        scale (Tensor): standard deviations of :math:`q(z|a,c)`, ``[*, C, d]``.
+        loc, scale (Tensor): means and standard deviations of :math:`q(z|a,c)`, ``[*, C, d]``.
         prior_loc (Tensor): :math:`\mu_c`, ``[C, d]``.
         prior_scale (Tensor): square roots of the diagonal of :math:`\Sigma_c`, ``[C, d]``.
         prior_logits (Tensor, optional): logits of :math:`p(c)`, ``[C]``; ``None`` is uniform.
