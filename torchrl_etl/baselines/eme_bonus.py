@@ -82,6 +82,10 @@ class EMEBonus(TransitionReward):
         torch.Size([5, 1])
     """
 
+    encoder: TensorDictModuleBase
+    ensemble: TensorDictModuleBase
+    """Those given at construction, not copies."""
+
     _cure = "name the right one in in_keys."
 
     def __init__(
@@ -108,23 +112,13 @@ class EMEBonus(TransitionReward):
         check_real("[1, inf)", max_scale=max_scale)
         check_real("[0, inf)", weight=weight)
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
-        # In a tuple they are no submodules: as such they would follow the env's device, be put in
-        # eval mode under the learner's feet, and be saved twice.
-        self._networks = (encoder, ensemble)
+        # No submodules: as such they would follow the env's device, be put in eval mode under the
+        # learner's feet, and be saved twice.
+        self.__dict__ |= {"encoder": encoder, "ensemble": ensemble}
         self.weight, self.max_scale = weight, max_scale
         self.deviation = RunningDeviation(decay) if normalize else None
         self.reward_deviation = RunningDeviation(decay) if normalize else None
         self.reward_key = unravel_key(reward_key)
-
-    @property
-    def encoder(self) -> TensorDictModuleBase:
-        """The encoder given at construction, not a copy."""
-        return self._networks[0]
-
-    @property
-    def ensemble(self) -> TensorDictModuleBase:
-        """The ensemble given at construction, not a copy."""
-        return self._networks[1]
 
     @property
     def _typed_by(self) -> NestedKey:

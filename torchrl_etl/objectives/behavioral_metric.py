@@ -188,14 +188,7 @@ class BehavioralMetricLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Losses of one batch of transitions.
-
-        Args:
-            tensordict (TensorDictBase): transitions with any batch size; left unchanged.
-
-        Returns:
-            TensorDictBase: the entries named under ``Keys``.
-        """
+        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
         reward = tensordict["next"].get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale

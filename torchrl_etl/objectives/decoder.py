@@ -89,14 +89,7 @@ class DecoderLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Loss of one batch of (synergy, action) pairs.
-
-        Args:
-            tensordict (TensorDictBase): pairs with any batch size; left unchanged.
-
-        Returns:
-            TensorDictBase: ``loss_decoder``.
-        """
+        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
         synergy = tensordict.get(self.tensor_keys.synergy).detach()
         action = tensordict.get(self.tensor_keys.action).detach()
         inputs = TensorDict({self.decoder.in_keys[0]: synergy}, synergy.shape[:-1])

@@ -103,14 +103,7 @@ class GMVAELoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Loss of one batch of actions.
-
-        Args:
-            tensordict (TensorDictBase): actions with any batch size; left unchanged.
-
-        Returns:
-            TensorDictBase: the entries named under ``Keys``.
-        """
+        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
         action = tensordict.get(self.tensor_keys.action).detach()
         gmvae = self.gmvae
         with self.gmvae_params.to_module(gmvae, preserve_module_state=False):

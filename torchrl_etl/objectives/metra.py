@@ -137,14 +137,7 @@ class METRALoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Losses of one batch of transitions.
-
-        Args:
-            tensordict (TensorDictBase): transitions with any batch size; left unchanged.
-
-        Returns:
-            TensorDictBase: the entries named under ``Keys``.
-        """
+        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
         direction = tensordict.get(self.tensor_keys.direction).detach()
         batch_size = direction.shape[:-1]
         embedding = self._embed(tensordict, batch_size)

@@ -98,6 +98,9 @@ class IntrinsicReward(ScaledBonus):
         torch.Size([5, 1])
     """
 
+    encoder: TensorDictModuleBase
+    """The encoder given at construction, not a copy."""
+
     _cure = (
         "put the transform that writes it (DirectionPrimer for the direction) before "
         "IntrinsicReward."
@@ -119,12 +122,7 @@ class IntrinsicReward(ScaledBonus):
         super().__init__(in_keys, out_key, **scale)
         # Outside the module list: as a submodule the encoder would follow the env's device, be put
         # in eval mode under the learner's feet, and be saved twice.
-        self.__dict__["_encoder"] = encoder
-
-    @property
-    def encoder(self) -> TensorDictModuleBase:
-        """The encoder given at construction, not a copy."""
-        return self._encoder
+        self.__dict__["encoder"] = encoder
 
     @property
     def _carried(self) -> Sequence[NestedKey]:

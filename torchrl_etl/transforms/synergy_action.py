@@ -33,11 +33,8 @@ class SynergyAction(LatentAction):
     Keyword Args:
         synergy_key (NestedKey): what the policy writes. ``"action"`` serves policies that know no
             other key; the recorded ``"action"`` is then the synergy. Default: ``"synergy"``.
-        executed_key (NestedKey): where the executed action is recorded.
-            Default: ``"executed_action"``.
-        action_key (NestedKey, optional): the base env's action. Default: the decoder's out-key.
-        decoded_key (NestedKey, optional): where a collector's batch has the decoded action.
-            Default: ``action_key``, and ``"decoded_action"`` beside it where the synergy is there.
+        executed_key, action_key, decoded_key (NestedKey, optional): see
+            :class:`~torchrl_etl.transforms.LatentAction`.
 
     Keys:
         reads ``synergy`` [*, d] in [-1, 1]; writes ``("next", "executed_action")``, of the base
