@@ -27,9 +27,6 @@ class DirectionExploration(Exploration):
 
     Equation: 1, r^b = ⟨φ(s') - φ(s), z⟩.
 
-    Args:
-        spec (EnvironmentSpec): sizes, bounds and device of the environment.
-
     Keyword Args:
         encoder, direction, bonus (mapping): keyword arguments of
             :class:`~torchrl_etl.modules.StateEncoder`,

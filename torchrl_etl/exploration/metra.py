@@ -19,9 +19,6 @@ class METRAExploration(DirectionExploration):
 
     Equation: see :class:`~torchrl_etl.objectives.METRALoss`.
 
-    Args:
-        spec (EnvironmentSpec): sizes, bounds and device of the environment.
-
     Keyword Args:
         lr (float, optional): learning rate of φ and of the multiplier; ``None``: the learner's.
         metra (mapping): keyword arguments of the loss.

@@ -20,9 +20,6 @@ class MetricExploration(DirectionExploration):
 
     Equation: 2, 3, 5 and 6, see :class:`~torchrl_etl.objectives.BehavioralMetricLoss`.
 
-    Args:
-        spec (EnvironmentSpec): sizes, bounds and device of the environment.
-
     Keyword Args:
         lr (float, optional): learning rate of φ; ``None``: the learner's.
         tau (float): EMA rate of the target encoder.

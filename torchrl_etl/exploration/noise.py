@@ -22,9 +22,6 @@ Color = Literal["pink", "held"]
 class NoiseExploration(Exploration):
     """No policy learns: the cheapest control of any other exploration.
 
-    Args:
-        spec (EnvironmentSpec): sizes, bounds and device of the environment.
-
     Keyword Args:
         color (str): ``"pink"``, see :class:`~torchrl_etl.modules.lasting_noise.PinkNormal`, or
             ``"held"``, see :class:`~torchrl_etl.modules.lasting_noise.HeldNormal`.

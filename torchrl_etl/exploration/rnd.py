@@ -28,9 +28,6 @@ class RNDExploration(Exploration):
 
     Equation: see :class:`~torchrl_etl.transforms.RNDBonus`.
 
-    Args:
-        spec (EnvironmentSpec): sizes, bounds and device of the environment.
-
     Keyword Args:
         features (int): outputs of the random network.
         hidden (sequence of int): widths of its layers and of the predictor's.

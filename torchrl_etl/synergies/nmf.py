@@ -20,10 +20,6 @@ class NMFSynergies(AffineSynergies):
     The decoder has its slope and its action in the middle of the box of coefficients, and bends
     where a muscle nears its bounds, where the model would pass them.
 
-    Args:
-        low, high (Tensor): bounds of the action [n].
-        num_synergies (int): d, at most n.
-
     Keyword Args:
         max_iter (int): iterations of the factorization at most.
 

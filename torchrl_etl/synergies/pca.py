@@ -18,10 +18,6 @@ class PCASynergies(AffineSynergies):
 
     The decoder is exactly the model: a = tanh(mean + c·basis) where the bounds are [-1, 1].
 
-    Args:
-        low, high (Tensor): bounds of the action [n].
-        num_synergies (int): d, at most n.
-
     Examples:
         >>> low, high = -torch.ones(8), torch.ones(8)
         >>> _ = torch.manual_seed(0)

@@ -24,10 +24,6 @@ class SARSynergies(AffineSynergies):
     affine kind: it bends where a muscle nears its bounds, spans the 1st to the 99th percentile,
     and adds a residual before the bounds, whose entropy is corrected.
 
-    Args:
-        low, high (Tensor): bounds of the action [n].
-        num_synergies (int): d, at most n.
-
     Keyword Args:
         max_iter (int): iterations of the search for independent components at most.
         seed (int): of that search.
