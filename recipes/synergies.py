@@ -77,7 +77,8 @@ def main(config: DictConfig) -> None:
         leave(folder, recording, models[chosen], found, config)
     enough = found[chosen].held_out >= config.vaf
     print(
-        f"{chosen} synergies account for {found[chosen].held_out:.0%} of held-out rows"
+        f"{chosen} {'synergy accounts' if chosen == 1 else 'synergies account'} for "
+        f"{found[chosen].held_out:.0%} of held-out rows"
         + ("" if enough else f", none of these numbers for {config.vaf:.0%}")
     )
     print(f"  all of it   {folder}")

@@ -58,7 +58,7 @@ class Body:
         self._server, self._model, self._data = server, model, data
         server.scene.reset()
         server.scene.set_up_direction("+z")
-        # Without a GPU an environment map takes half of the time of a picture, so a lamp fills the shade.
+        # An environment map doubles the time of a picture without a GPU; a lamp fills the shade.
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(cast_shadow=False)  # dear there too
         server.scene.add_light_directional("/lamp", position=(0.9, -1.0, -0.3), intensity=0.5)
