@@ -194,6 +194,7 @@ def test_a_method_that_does_not_tell_of_its_actor_is_one_sentence(monkeypatch):
         ["method=sac", "goal=random", "frames=700", "learn.sac.lr=1e-3", "seed=3"],
         ["method=lattice", "action_repeat=2", "critic.hidden=[16]", "collector=process"],
         ["synergies=nmf", "exploration=metra", "+env_kwargs.max_episode_steps=9", "faithful=paper"],
+        ["+env_kwargs.words=['a,b','1','it\\'s (so)',\"x\"]", "success_key='a=b'"],
     ],
 )
 def test_the_command_on_a_card_makes_the_same_configuration(overrides):

@@ -16,9 +16,11 @@ from torchrl_etl.extras import extra
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training import evaluate_task, resumed_config
+from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.zoo import Card, describe_decoder, make_policy, save_entry
 
 with extra("recipes"):
+    from hydra.core.override_parser.types import Quote, QuotedString
     from hydra.errors import HydraException
     from omegaconf import DictConfig, OmegaConf
 
@@ -172,4 +174,13 @@ def _in_words(value: Any) -> str:
         return f"[{','.join(map(_in_words, value))}]"
     if isinstance(value, dict):
         return "{" + ",".join(f"{key}:{_in_words(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, str) and not _reads_as_itself(value):
+        return QuotedString(value, Quote.single).with_quotes()
     return str(value)
+
+
+def _reads_as_itself(text: str) -> bool:
+    """Whether Hydra takes a word without quotes for this text, and not for a number or a list."""
+    with suppress(ValueError):
+        return parse_override(f"word={text}").value() == text
+    return False

@@ -50,11 +50,9 @@ def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor,
 
     All terminated next states are one absorbing state, embedded at the origin.
     """
-    embedding, following = (
-        outputs(loss.encoder, loss.encoder_params, tensordict),
-        tensordict["next"],
-    )
+    embedding = outputs(loss.encoder, loss.encoder_params, tensordict)
     with torch.no_grad():
+        following = tensordict["next"]
         next_embedding = outputs(loss.encoder, loss.target_encoder_params, following)
         ended = following.get(loss.tensor_keys.terminated).reshape(-1, 1)
         return embedding, next_embedding.masked_fill(ended, 0.0)
