@@ -26,6 +26,7 @@ from torchrl_etl.command_line import (
     quote_paths,
 )
 from torchrl_etl.opened import open_bundle, open_run, open_zoo
+from torchrl_etl.zoo import bundle_path
 
 CONF = Path(__file__).parent / "conf"
 SOURCES = ("run", "zoo", "bundle")
@@ -63,7 +64,7 @@ def open_subject(config: DictConfig) -> Subject:
         return open_zoo(config.zoo)
     if named == ["run"]:
         return open_run(Path(config.run), defaults=hydra.compose("config"))
-    return open_bundle(Path(config.bundle), config.env, goal=config.goal)
+    return open_bundle(bundle_path(config.bundle), config.env, goal=config.goal)
 
 
 if __name__ == "__main__":

@@ -211,6 +211,13 @@ def test_view_says_in_a_sentence_what_to_name(recipe, settings, message):
         recipe.open_subject(OmegaConf.merge(defaults, settings))
 
 
+def test_view_takes_a_bundle_of_the_zoo_to_another_task_of_its_body(recipe):
+    defaults = OmegaConf.load(ROOT / "recipes" / "conf" / "view.yaml")
+    settings = {"bundle": "zoo:myohand", "env": "myoHandKeyTurn"}
+    subject = recipe.open_subject(OmegaConf.merge(defaults, settings))
+    assert (subject.task.name, subject.decoder.num_synergies) == ("myoHandKeyTurn", 8)
+
+
 @pytest.mark.slow
 def test_view_prints_an_address_that_answers_and_ctrl_c_ends_it(tmp_path):
     names = actuator_names("cartpole-balance")

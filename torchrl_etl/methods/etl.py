@@ -54,12 +54,6 @@ def default_num_synergies(actuators: int) -> int:
     return min(MOST_SYNERGIES, max(1, actuators // 2))
 
 
-def bundle_path(given: str) -> Path:
-    """Where the synergies are that ``synergies=`` names: a path, or an entry as ``zoo:NAME``."""
-    entry = given.removeprefix("zoo:")
-    return (Path(given).expanduser() if entry == given else zoo.synergies(entry)).resolve()
-
-
 class ETL(Method):
     """Algorithm 1: explore and condense, or take a bundle; then SAC on synergy coefficients.
 
@@ -103,7 +97,8 @@ class ETL(Method):
         config, space = self.context.config, self.context.spec
         given, own = config.synergies.bundle, self.context.folder.synergies
         # The absolute path stands in the run's configuration.
-        self.explores_nothing(bundle=given if given == BODY else str(bundle_path(given)))
+        absolute = given if given == BODY else str(zoo.bundle_path(given).resolve())
+        self.explores_nothing(bundle=absolute)
         config.stage = "learn"
         if given == BODY and not surviving_folder(own).exists():
             with closing(self.context.make_env(seed=0)) as env:

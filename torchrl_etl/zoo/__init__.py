@@ -9,6 +9,7 @@ torch.Size([3, 16])
 from torchrl_etl.zoo.card import Card, ZooError
 from torchrl_etl.zoo.entry import (
     ENTRIES,
+    bundle_path,
     find,
     load,
     names,
@@ -24,6 +25,7 @@ __all__ = [
     "ENTRIES",
     "Card",
     "ZooError",
+    "bundle_path",
     "describe_decoder",
     "find",
     "load",

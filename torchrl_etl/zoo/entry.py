@@ -181,6 +181,20 @@ def synergies(name: str | os.PathLike[str]) -> Path:
     return folder
 
 
+def bundle_path(given: str) -> Path:
+    """Where the synergies are that a setting names: a path, or an entry as ``zoo:NAME``.
+
+    Raises:
+        ZooError: as :func:`synergies` does.
+
+    Examples:
+        >>> bundle_path("zoo:myohand") == synergies("myohand")
+        True
+    """
+    entry = given.removeprefix("zoo:")
+    return Path(given).expanduser() if entry == given else synergies(entry)
+
+
 def synergies_alone(name: str | os.PathLike[str]) -> bool:
     """Whether an entry is a synergy bundle without a policy.
 
