@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 from torchrl_etl.envs import joint_torques, make_env, muscle_changes
+from torchrl_etl.envs.myosuite import register_myosuite
 
 TASK = "myoLegWalk"
 ENV_ID = "FeedbackLegWalk-v0"
@@ -61,7 +62,7 @@ class JointFeedback(gym.Wrapper):
 
 def make(*, kp: float = 1.0, kd: float = 0.1, **options: Any) -> gym.Env:
     """Builds the task; options are those of myoLegWalk."""
-    make_env(TASK).close()  # MyoSuite's tasks are registered on demand
+    register_myosuite()
     inner = gym.make(f"{TASK}-v0", disable_env_checker=True, **options).unwrapped
     return JointFeedback(inner, kp=kp, kd=kd)
 
