@@ -3,10 +3,11 @@
     python benchmarks/seeds_wall_clock.py
     python benchmarks/seeds_wall_clock.py --env myoLegWalk --frames 20000
 
-Whole commands of the recipe, from start to summary, on all cores; they take turns. Each process has
-one thread for PyTorch. ``ahead`` has the seeds' simulators in processes of their own, one batch
-ahead of the learners; the others step them in the process that learns. A ratio is to
-``processes``, and on two cores it is 1 where a seed in company is no slower than alone.
+Whole commands of the recipe, from start to summary, on all cores; they take turns. ``processes``
+have a thread of PyTorch each, one process has as many as there are cores. ``ahead`` has the seeds'
+simulators in processes of their own, one batch ahead of the learners; the others step them in the
+process that learns. A ratio is to ``processes``, and on two cores 1 where a seed in company is
+no slower than alone.
 """
 
 from __future__ import annotations
@@ -50,10 +51,10 @@ def main() -> None:
     arguments = parser.parse_args()
 
     run = [sys.executable, str(RECIPE), f"env={arguments.env}", f"frames={arguments.frames}"]
-    run += ["method=sac", "threads=1", "compile=true", "progress=false", "pictures=false"]
+    run += ["method=sac", "compile=true", "progress=false", "pictures=false"]
     run += ["evaluation.every=0", "evaluation.episodes=1", *arguments.overrides]
     together = [*run, f"seeds=[{','.join(map(str, SEEDS))}]"]
-    alone = [[*run, f"seed={seed}"] for seed in SEEDS]
+    alone = [[*run, "threads=1", f"seed={seed}"] for seed in SEEDS]
     cases = {
         "processes": partial(seconds, alone),
         "one_process": partial(seconds, [together]),

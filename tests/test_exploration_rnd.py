@@ -78,9 +78,9 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
         batches.append(found.stage.sample())
     group = SideBySide([found.stage.learner for found in twins[0]])
     draws = []
-    for batch in batches:
+    for learner, batch in zip(group.learners, batches, strict=True):
         torch.manual_seed(1)
-        draws.append(group.draw(batch))
+        draws.append(learner.draw(batch))
     together = group.update(batches, draws)
     for found, batch, scalars in zip(twins[1], batches, together, strict=True):
         torch.manual_seed(0)

@@ -10,7 +10,7 @@ from torchrl.data import Bounded
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
-from torchrl_etl.learners import SACLearner, SideBySide
+from torchrl_etl.learners import InThreads, SACLearner, SideBySide
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.learners.side_by_side import stacked
 from torchrl_etl.modules import make_critic
@@ -40,9 +40,9 @@ class Descent(torch.optim.SGD):
 def draws(group, batches):
     """The random numbers of each learner, of a generator that was seeded with its seed."""
     drawn = []
-    for seed, batch in zip(SEEDS, batches, strict=True):
+    for seed, learner, batch in zip(SEEDS, group.learners, batches, strict=True):
         torch.manual_seed(seed)
-        drawn.append(group.draw(batch))
+        drawn.append(learner.draw(batch))
     return drawn
 
 
@@ -136,6 +136,30 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
         torch.testing.assert_close(other, one)
 
 
+@pytest.mark.parametrize("name", MAKERS)
+def test_learners_in_threads_end_where_each_ends_that_draws_for_itself(name, traced_only):
+    ours, theirs = ([MAKERS[name](f"seed={seed}") for seed in SEEDS] for _ in range(2))
+    for stage in (*ours, *theirs):
+        fill(stage)
+        stage.close()
+    group = InThreads([stage.learner for stage in ours])
+    for learner in group.learners:
+        learner._gradients = compiled(learner.gradients)
+    batches = [torch.stack([stage.sample() for _ in range(2)]) for stage in ours]
+    drawn, expected = [], []
+    for seed, one, other, earned in zip(SEEDS, ours, theirs, batches, strict=True):
+        other.learner.objective.load_state_dict(one.learner.objective.state_dict())
+        torch.manual_seed(seed)
+        drawn.append([one.learner.draw(batch) for batch in earned])
+        torch.manual_seed(seed)
+        expected.append(other.learner.updates(earned))
+    for found, alone in zip(group.updates(batches, drawn), expected, strict=True):
+        assert (found == alone).all()
+    for one, other in zip(ours, theirs, strict=True):
+        pairs = zip(one.learner.parameters, other.learner.parameters, strict=True)
+        assert all(torch.equal(found, expected) for found, expected in pairs)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(name, traced_only):
@@ -159,11 +183,11 @@ def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(
 def test_finding_out_what_is_drawn_draws_nothing():
     stage = learn_stage()
     fill(stage)
-    batch, group = stage.sample(), SideBySide([stage.learner])
+    batch, learner = stage.sample(), stage.learner
     torch.manual_seed(0)
-    first = group.draw(batch)
+    first = learner.draw(batch)
     torch.manual_seed(0)
-    second = group.draw(batch)
+    second = learner.draw(batch)
     assert first and all(torch.equal(one, two) for one, two in zip(first, second, strict=True))
     stage.close()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 from tests.configs import tiny
@@ -11,7 +12,7 @@ from tests.runs import numbers
 from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.training import Interrupted, alone, resumed_config, together
 from torchrl_etl.training.context import stage_seed
 from torchrl_etl.training.loop import StopOnSignal
@@ -85,12 +86,17 @@ def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypat
     assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]
 
 
-def test_seeds_whose_updates_are_compiled_for_a_cpu_take_turns(tmp_path, monkeypatch):
-    def refuse(*arguments):
-        raise AssertionError("a joint pass")
+def test_seeds_that_are_compiled_for_a_cpu_are_updated_in_threads(tmp_path, monkeypatch):
+    threads, updates = set(), SACLearner.updates
 
-    monkeypatch.setattr(SideBySide, "__init__", refuse)
+    def told(learner, *arguments):
+        threads.add(threading.get_ident())
+        return updates(learner, *arguments)
+
     monkeypatch.setattr("torchrl_etl.learners.sac.compiled", lambda function: function)
-    settings = ("method=sac", "compile=true")
-    ends = together([work(tmp_path / f"{seed}", seed, *settings) for seed in (0, 1)])
-    assert [end["seed"] for end in ends] == [0, 1]
+    monkeypatch.setattr(SACLearner, "updates", told)
+    together([work(tmp_path / f"{seed}", seed, "compile=true") for seed in (0, 1)])
+    assert len(threads - {threading.get_ident()}) == 4  # two a stage
+    for seed in (0, 1):
+        alone(work(tmp_path / f"alone{seed}", seed, "compile=true"))
+        assert numbers(tmp_path / f"{seed}") == numbers(tmp_path / f"alone{seed}")

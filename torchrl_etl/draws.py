@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from threading import local
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +19,7 @@ __all__ = [
     "Draw",
     "given_draws",
     "recorded_draws",
+    "redrawn",
     "standard_normal",
     "standard_uniform",
     "uniform_order",
@@ -25,8 +28,8 @@ __all__ = [
 Draw = Callable[[], Tensor]
 
 
-class _Source:
-    """Where the next numbers come from: a list of what is given, or the generator."""
+class _Source(local):
+    """Where a thread's next numbers come from: a list of what is given, or the generator."""
 
     given: list[Tensor] | None = None
     recorded: list[Draw] | None = None
@@ -84,6 +87,30 @@ def recorded_draws() -> Iterator[list[Draw]]:
         yield _source.recorded
     finally:
         _source.recorded = None
+
+
+def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
+    """Draws, when called as ``function`` is, what that would draw, from the generators as they are.
+
+    What is drawn is found out by the first call, which runs ``function``; it must be the same for
+    all arguments.
+
+    Examples:
+        >>> draw = redrawn(lambda x: x + standard_normal(x))
+        >>> [numbers.shape for numbers in draw(torch.zeros(2, 3))]
+        [torch.Size([2, 3])]
+    """
+    known: list[Draw] | None = None
+
+    def draws(*args: Any) -> list[Tensor]:
+        nonlocal known
+        if known is None:
+            with torch.random.fork_rng(), recorded_draws() as found, torch.no_grad():
+                function(*args)
+            known = found
+        return [draw() for draw in known]
+
+    return draws
 
 
 def _next(draw: Draw) -> Tensor:

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from functools import wraps
+from threading import Lock
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 __all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
+_tracing = Lock()  # neither tracer nor compiler is made for several threads
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -59,7 +61,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             graph = next((graph for known, graph in graphs if known == kind), None)
             if graph is None:
-                graph = _graph(function, spec, leaves)
+                with _tracing:
+                    graph = _graph(function, spec, leaves)
                 graphs.append((kind, graph))
             return graph(leaves)
         except Exception as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any, Literal
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
+from torchrl_etl.draws import given_draws, redrawn
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -136,22 +138,31 @@ class SACLearner:
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self.draw = redrawn(self.objective)
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
-    def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Learn from a batch of transitions [B]; returns scalars to log."""
-        scalars = self._step(batch)
+    def update(
+        self, batch: TensorDictBase, draws: Sequence[Tensor] | None = None
+    ) -> TensorDictBase:
+        """Learn from a batch of transitions [B]; returns scalars to log.
+
+        With ``draws``, which are ``learner.draw(batch)``, it draws nothing, so that it may run in a
+        thread beside other learners; a CUDA graph draws for itself, and is left out then.
+        """
+        scalars = self._step(batch) if draws is None else self.step(batch, draws)
         self.ema.follow()  # counts in Python: no part of a CUDA graph
         return scalars
 
-    def updates(self, batches: TensorDictBase) -> TensorDictBase:
+    def updates(
+        self, batches: TensorDictBase, *draws: Sequence[Sequence[Tensor]]
+    ) -> TensorDictBase:
         """Learn from batches [k, B], one after the other; returns scalars to log [k]."""
-        return torch.stack([self.update(batch) for batch in batches])
+        return torch.stack([self.update(*turn) for turn in zip(batches, *draws, strict=True)])
 
-    def step(self, batch: TensorDictBase) -> TensorDictBase:
+    def step(self, batch: TensorDictBase, *draws: Sequence[Tensor]) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
-        gradients, scalars = self._gradients(batch)
+        gradients, scalars = self._gradients(batch, *draws)
         self.descend(gradients)
         return scalars
 
@@ -162,9 +173,12 @@ class SACLearner:
         for target in self.targets:
             target.step()
 
-    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+    def gradients(
+        self, batch: TensorDictBase, *draws: Sequence[Tensor]
+    ) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         """Gradients of the objective, in the order of ``parameters``, and scalars to log."""
-        loss, scalars = self.objective(batch)
+        with given_draws(*draws) if draws else nullcontext():
+            loss, scalars = self.objective(batch)
         return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
 
     def update_term(self, term: Term, batch: TensorDictBase) -> TensorDictBase:

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.draws import Draw, given_draws, recorded_draws
+from torchrl_etl.draws import given_draws
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.sac import SACLearner
 
@@ -47,7 +46,7 @@ class SideBySide:
         >>> entries["next"] = {"observation": torch.randn(4, 3), **ends}
         >>> batches = [TensorDict(entries, [4]) for _ in range(2)]
         >>> group = SideBySide([learner(), learner()])
-        >>> draws = [group.draw(batch) for batch in batches]
+        >>> draws = [each.draw(batch) for each, batch in zip(group.learners, batches)]
         >>> logs = group.update(batches, draws)
         >>> [log["loss_qvalue"].shape for log in logs]
         [torch.Size([]), torch.Size([])]
@@ -63,24 +62,10 @@ class SideBySide:
                 "updated side by side only where observations, actions and networks agree."
             )
         self.learners = list(learners)
-        self._draws: list[Draw] | None = None
         first = learners[0]
         self._gradients = compiled(self.gradients) if first.compile else self.gradients
         graphed = first.compile and first.device.type == "cuda"
         self._step = cuda_graph(self.step) if graphed else self.step
-
-    def draw(self, batch: TensorDictBase) -> list[Tensor]:
-        """The random numbers of one learner's update, from the generators as they are.
-
-        Args:
-            batch (TensorDictBase): any batch [B] of such updates; it tells what is drawn.
-        """
-        if self._draws is None:
-            random = GlobalRNGState().state_dict()
-            with recorded_draws() as self._draws, torch.no_grad():
-                self.learners[0].objective(batch)
-            GlobalRNGState().load_state_dict(random)
-        return [draw() for draw in self._draws]
 
     def update(
         self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]

@@ -8,7 +8,7 @@ from typing import Any, Generic
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners import InThreads, SideBySide
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.work import Due, Result, Work, alone
 
@@ -18,7 +18,7 @@ __all__ = ["together"]
 def together(
     works: Sequence[Work[Result]], *, joint: bool | None = None
 ) -> list[Result | BaseException]:
-    """Do all works in turns, and updates that are due at the same time as one if ``joint``.
+    """Do all works in turns, and updates that are due at the same time together.
 
     Each work finds the random generators as it left them, and its updates get the random numbers
     that it would have drawn for them by itself: it ends with the numbers of
@@ -30,8 +30,8 @@ def together(
             takes one.
 
     Keyword Args:
-        joint (bool, optional): one pass through the networks of all. Default: unless updates are
-            compiled for a CPU, which is no faster in one pass than one after another.
+        joint (bool, optional): one pass through the networks of all, rather than a thread for
+            each. Default: unless updates are compiled for a CPU.
 
     Returns:
         list: what each work returned, or the exception that ended it.
@@ -42,7 +42,7 @@ def together(
         except (Exception, Interrupted) as error:
             return [error]
     runs = [_Run(work) for work in works]
-    groups: dict[str, SideBySide] = {}
+    groups: dict[str, SideBySide | InThreads] = {}
     try:
         for run in runs:
             run.go_on(None)
@@ -84,25 +84,24 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, error
 
 
-def _update(runs: Sequence[_Run], groups: dict[str, SideBySide], joint: bool | None) -> None:
+def _update(
+    runs: Sequence[_Run], groups: dict[str, SideBySide | InThreads], joint: bool | None
+) -> None:
     """Update the learners of these runs, which are in the same stage."""
-    if joint is None:
-        learner = runs[0].due.learner
-        joint = not learner.compile or learner.device.type != "cpu"
-    if len(runs) == 1 or not joint:
-        for run in runs:
-            with run:
-                scalars = run.due.learner.updates(run.due.batches)
-            run.go_on(scalars)
-        return
     learners = [run.due.learner for run in runs]
+    if len(runs) == 1:
+        with runs[0]:
+            scalars = learners[0].updates(runs[0].due.batches)
+        return runs[0].go_on(scalars)
     group = groups.get(stage := runs[0].due.stage)
     if group is None or group.learners != learners:
-        group = groups[stage] = SideBySide(learners)
+        if joint is None:
+            joint = not learners[0].compile or learners[0].device.type != "cpu"
+        group = groups[stage] = (SideBySide if joint else InThreads)(learners)
     draws = []
     for run in runs:
         with run:
-            draws.append([group.draw(batch) for batch in run.due.batches])
+            draws.append([run.due.learner.draw(batch) for batch in run.due.batches])
     scalars = group.updates([run.due.batches for run in runs], draws)
     for run, own in zip(runs, scalars, strict=True):
         run.go_on(own)
