@@ -21,7 +21,8 @@ from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 __all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
-_tracing = Lock()  # neither tracer nor compiler is made for several threads
+# The process has one tracer, one compiler and one exploration type, which TorchRL's losses set.
+_in_python = Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,7 +40,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
     the compiler does not know) costs a warning that says why; the function then runs uncompiled,
-    this call included. It must change nothing but what it returns.
+    this call included. It must change nothing but what it returns. Compiled calls of several
+    threads run at the same time; others take turns.
 
     Examples:
         >>> import torch
@@ -55,13 +57,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         nonlocal failed
         if failed:
-            return function(*args)
+            with _in_python:
+                return function(*args)
         leaves, spec = tree_flatten(args)
         kind = spec, [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
         try:
             graph = next((graph for known, graph in graphs if known == kind), None)
             if graph is None:
-                with _tracing:
+                with _in_python:
                     graph = _graph(function, spec, leaves)
                 graphs.append((kind, graph))
             return graph(leaves)
@@ -72,7 +75,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
                 RuntimeWarning,
                 stacklevel=2,
             )
-        return function(*args)
+        with _in_python:
+            return function(*args)
 
     return call
 
