@@ -18,7 +18,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 
 from tests.point_env import PointTask
 from tests.synergy_policy import decode_to, synergy_policy
-from torchrl_etl.collectors import CollectionError, VectorCollector, make_batches
+from torchrl_etl.collectors import Batches, CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
 from torchrl_etl.learners.sac import episode_numbers
 from torchrl_etl.modules import make_actor
@@ -215,9 +215,39 @@ def test_workers_of_a_killed_learner_end_too(tmp_path):
 
 def test_single_cannot_run_ahead():
     with pytest.raises(ValueError, match="takes a second process"):
-        from torchrl_etl.collectors import Batches
-
         Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)
+
+
+def test_the_learner_keeps_its_threads_and_who_asks_the_workers_has_one(monkeypatch):
+    monkeypatch.setattr(torch, "set_num_threads", recorded := Recorded(torch.set_num_threads))
+
+    class Workers(list):
+        def __init__(self):
+            self.threads = torch.get_num_threads()
+            torch.set_num_threads(5)  # as TorchRL's collectors do
+
+        shutdown = __init__
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        batches = Batches(Workers)
+        assert batches._collector.threads == 1 and recorded.last == 3
+        batches.close()
+        assert torch.get_num_threads() == 3 and recorded.last == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+class Recorded:
+    """A function, and the argument of its last call, whichever thread made it."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, argument):
+        self.last = argument
+        self.function(argument)
 
 
 def test_an_unknown_kind_is_named(policy):

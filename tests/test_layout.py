@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import pytest
 
 import torchrl_etl.layout as layout
@@ -17,7 +19,7 @@ def auto(*overrides):
 @pytest.fixture
 def speeds(monkeypatch):
     """Frames a second by layout, which the test fills in, on two cores."""
-    table = {}
+    table = defaultdict(float)
     monkeypatch.setattr(layout, "available_cores", lambda: 2)
     monkeypatch.setattr(layout, "frames_per_second", lambda stage, each, seconds: table[each])
     return table
@@ -25,9 +27,19 @@ def speeds(monkeypatch):
 
 def test_layouts_of_many_cores_share_a_batch_evenly():
     found = layouts(6, most_workers=12)
-    assert [each.num_workers for each in found] == [0, 1, 1, 2, 2, 4, 4]
-    assert [each.threads for each in found] == [6, 5, 6, 4, 6, 2, 6]
+    assert [each.num_workers for each in found] == [0, 1, 1, 2, 2, 4, 4, 4]
+    assert [each.threads for each in found] == [6, 5, 6, 4, 6, 2, 6, 6]
+    assert [each.ahead for each in found] == 7 * [True] + [False]
     assert max(each.num_workers for each in layouts(6, most_workers=6)) == 2
+
+
+def test_as_many_workers_as_cores_take_turns_with_the_learner():
+    assert [layouts(cores, most_workers=8)[-1].num_workers for cores in (2, 4, 6, 32)] == [
+        2,
+        4,
+        4,
+        8,
+    ]
 
 
 def test_layouts_of_one_core_have_no_worker():
@@ -35,13 +47,19 @@ def test_layouts_of_one_core_have_no_worker():
 
 
 @pytest.mark.parametrize(
-    "fastest, kind, ahead", [(Layout(1, 2), "process", True), (Layout(0, 2), "single", False)]
+    "fastest, kind, ahead",
+    [
+        (Layout(1, 2), "process", True),
+        (Layout(0, 2), "single", False),
+        (Layout(2, 2, ahead=False), "process", False),
+    ],
 )
 def test_choose_layout_takes_and_names_the_fastest(speeds, fastest, kind, ahead):
     speeds |= {Layout(0, 2): 70.0, Layout(1, 1): 60.0, Layout(1, 2): 65.0, fastest: 90.0}
     said = []
     chosen = choose_layout(auto(), say=said.append)
-    assert (chosen.collector.kind, chosen.collector.num_workers) == (kind, 1)
+    assert chosen.collector.kind == kind
+    assert chosen.collector.num_workers == max(1, fastest.num_workers)
     assert (chosen.collector.ahead, chosen.threads) == (ahead, fastest.threads)
     (line,) = said
     assert line.startswith(f"collector=auto takes {kind}, ") and "90" in line

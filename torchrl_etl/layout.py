@@ -26,22 +26,25 @@ class Layout(NamedTuple):
     """A way to share the cores.
 
     Attributes:
-        num_workers (int): processes that collect, one batch ahead; 0: the learner's process does,
-            in turn with learning.
+        num_workers (int): processes that collect; 0: the learner's process does.
         threads (int): of PyTorch in the learner's process.
+        ahead (bool): workers collect a batch while the learner learns on the last; else they take
+            turns.
     """
 
     num_workers: int
     threads: int
+    ahead: bool = True
 
     @property
     def collector(self) -> dict[str, str | int | bool]:
         """What the configuration's section of this name says then."""
         kind, workers = ("process", self.num_workers) if self.num_workers else ("single", 1)
-        return {"kind": kind, "num_workers": workers, "ahead": self.num_workers > 0}
+        return {"kind": kind, "num_workers": workers, "ahead": self.num_workers > 0 and self.ahead}
 
     def __str__(self) -> str:
-        workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}, "
+        in_turn = "" if self.ahead else "in turn, "
+        workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}, {in_turn}"
         kind = "process, " + workers if self.num_workers else "single, "
         return f"{kind}{self.threads} thread{'s' * (self.threads > 1)}"
 
@@ -98,6 +101,7 @@ def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[L
     """Ways to share so many cores, that of one process first.
 
     Beside workers the learner has the cores that they leave, or all: workers that are ahead wait.
+    As many workers as there are cores take turns with a learner that has them all.
 
     Args:
         cores (int): cores of the machine.
@@ -110,6 +114,7 @@ def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[L
         single, 2 threads
         process, 1 worker, 1 thread
         process, 1 worker, 2 threads
+        process, 2 workers, in turn, 2 threads
     """
     found = [Layout(0, threads or cores)]
     workers = 1
@@ -117,6 +122,9 @@ def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[L
         left = [threads] if threads else [cores - workers, cores]
         found += [Layout(workers, count) for count in left]
         workers *= 2
+    if cores > 1:
+        most = workers if workers <= cores and most_workers % workers == 0 else workers // 2
+        found.append(Layout(most, threads or cores, ahead=False))
     return found
 
 

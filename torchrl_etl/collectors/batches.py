@@ -5,11 +5,12 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import BaseCollector
 
@@ -77,7 +78,12 @@ class Batches:
         self._next: Future[TensorDictBase] | None = None
         self._is_stuck = False
         self._collector: BaseCollector | None = None
-        self._collector = self._do("start", make_collector)
+        with _threads_kept():
+            if self._caller is not None:
+                # With a team of OpenMP threads for the caller's operations there are more threads
+                # than cores, and libgomp puts the learner's to sleep between any two operations.
+                self._caller.call(torch.set_num_threads, 1)
+            self._collector = self._do("start", make_collector)
         self._iterator = iter(self._collector)
 
     def restart(self, seed: int) -> None:
@@ -109,7 +115,8 @@ class Batches:
             self._caller = _Caller()
         self._timeout = min(self._timeout, 30.0)
         try:
-            self._do("stop", collector.shutdown)
+            with _threads_kept():
+                self._do("stop", collector.shutdown)
         except CollectionError:
             _kill(collector)
         if self._caller is not None:
@@ -158,6 +165,16 @@ class Batches:
             f"The collector's workers did not {what} within {self._timeout:g} s; look for a "
             f"hanging simulator or network, or raise collector.timeout. {go_on}"
         )
+
+
+@contextmanager
+def _threads_kept() -> Iterator[None]:
+    """PyTorch keeps as many threads: those of MKL, which a process has once, and this thread's."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _kill(collector: BaseCollector) -> None:
