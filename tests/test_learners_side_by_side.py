@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -12,7 +10,7 @@ from torchrl.data import Bounded
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
-from torchrl_etl.learners import SACLearner, SideBySide
+from torchrl_etl.learners import InThreads, SACLearner, SideBySide
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.learners.side_by_side import stacked
 from torchrl_etl.modules import make_critic
@@ -139,13 +137,14 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_learners_given_their_draws_end_where_each_ends_that_draws_for_itself(name, traced_only):
+def test_learners_in_threads_end_where_each_ends_that_draws_for_itself(name, traced_only):
     ours, theirs = ([MAKERS[name](f"seed={seed}") for seed in SEEDS] for _ in range(2))
     for stage in (*ours, *theirs):
         fill(stage)
         stage.close()
-    for stage in ours:
-        stage.learner._gradients = compiled(stage.learner.gradients)
+    group = InThreads([stage.learner for stage in ours])
+    for learner in group.learners:
+        learner._gradients = compiled(learner.gradients)
     batches = [torch.stack([stage.sample() for _ in range(2)]) for stage in ours]
     drawn, expected = [], []
     for seed, one, other, earned in zip(SEEDS, ours, theirs, batches, strict=True):
@@ -154,11 +153,8 @@ def test_learners_given_their_draws_end_where_each_ends_that_draws_for_itself(na
         drawn.append([one.learner.draw(batch) for batch in earned])
         torch.manual_seed(seed)
         expected.append(other.learner.updates(earned))
-    with ThreadPoolExecutor() as threads:
-        updates = [stage.learner.updates for stage in ours]
-        found = list(threads.map(lambda update, *given: update(*given), updates, batches, drawn))
-    for scalars, alone in zip(found, expected, strict=True):
-        assert (scalars == alone).all()
+    for found, alone in zip(group.updates(batches, drawn), expected, strict=True):
+        assert (found == alone).all()
     for one, other in zip(ours, theirs, strict=True):
         pairs = zip(one.learner.parameters, other.learner.parameters, strict=True)
         assert all(torch.equal(found, expected) for found, expected in pairs)

@@ -101,7 +101,7 @@ def test_seeds_that_are_compiled_for_a_cpu_are_updated_in_threads(
 
     monkeypatch.setattr(SACLearner, "updates", told)
     together([work(tmp_path / f"{seed}", seed, "compile=true") for seed in (0, 1)])
-    assert len(threads) == 2 and threading.get_ident() not in threads
+    assert len(threads - {threading.get_ident()}) == 4  # two a stage
     for seed in (0, 1):
         alone(work(tmp_path / f"alone{seed}", seed, "compile=true"))
         assert numbers(tmp_path / f"{seed}") == numbers(tmp_path / f"alone{seed}")

@@ -18,12 +18,11 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
-__all__ = ["IN_PYTHON", "compiled", "cuda_graph"]
+__all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
-IN_PYTHON = Lock()
-"""For who runs losses, or what acts, while another thread may: the process has one tracer, one
-compiler and one exploration type, which TorchRL's losses set. Compiled updates do without."""
+# The process has one tracer, one compiler and one exploration type, which TorchRL's losses set.
+_in_python = Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -58,14 +57,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         nonlocal failed
         if failed:
-            with IN_PYTHON:
+            with _in_python:
                 return function(*args)
         leaves, spec = tree_flatten(args)
         kind = spec, [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
         try:
             graph = next((graph for known, graph in graphs if known == kind), None)
             if graph is None:
-                with IN_PYTHON:
+                with _in_python:
                     graph = _graph(function, spec, leaves)
                 graphs.append((kind, graph))
             return graph(leaves)
@@ -76,7 +75,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
                 RuntimeWarning,
                 stacklevel=2,
             )
-        with IN_PYTHON:
+        with _in_python:
             return function(*args)
 
     return call
