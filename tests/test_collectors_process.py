@@ -219,7 +219,10 @@ def test_single_cannot_run_ahead():
 
 
 def test_the_learner_keeps_its_threads_and_who_asks_the_workers_has_one(monkeypatch):
-    monkeypatch.setattr(torch, "set_num_threads", recorded := Recorded(torch.set_num_threads))
+    calls, set_num_threads = [], torch.set_num_threads
+    monkeypatch.setattr(
+        torch, "set_num_threads", lambda count: calls.append(count) or set_num_threads(count)
+    )
 
     class Workers(list):
         def __init__(self):
@@ -232,22 +235,11 @@ def test_the_learner_keeps_its_threads_and_who_asks_the_workers_has_one(monkeypa
     torch.set_num_threads(3)
     try:
         batches = Batches(Workers)
-        assert batches._collector.threads == 1 and recorded.last == 3
+        assert batches._collector.threads == 1 and calls[-1] == 3
         batches.close()
-        assert torch.get_num_threads() == 3 and recorded.last == 3
+        assert torch.get_num_threads() == 3 and calls[-1] == 3
     finally:
         torch.set_num_threads(before)
-
-
-class Recorded:
-    """A function, and the argument of its last call, whichever thread made it."""
-
-    def __init__(self, function):
-        self.function = function
-
-    def __call__(self, argument):
-        self.last = argument
-        self.function(argument)
 
 
 def test_an_unknown_kind_is_named(policy):

@@ -117,14 +117,13 @@ def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[L
         process, 2 workers, in turn, 2 threads
     """
     found = [Layout(0, threads or cores)]
-    workers = 1
-    while workers < cores and most_workers % workers == 0:
-        left = [threads] if threads else [cores - workers, cores]
-        found += [Layout(workers, count) for count in left]
-        workers *= 2
+    shares = [2**i for i in range(cores.bit_length()) if most_workers % 2**i == 0]
+    for workers in shares:
+        if workers < cores:
+            left = [threads] if threads else [cores - workers, cores]
+            found += [Layout(workers, count) for count in left]
     if cores > 1:
-        most = workers if workers <= cores and most_workers % workers == 0 else workers // 2
-        found.append(Layout(most, threads or cores, ahead=False))
+        found.append(Layout(shares[-1], threads or cores, ahead=False))
     return found
 
 

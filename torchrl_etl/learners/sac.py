@@ -142,15 +142,13 @@ class SACLearner:
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
-    def update(
-        self, batch: TensorDictBase, draws: Sequence[Tensor] | None = None
-    ) -> TensorDictBase:
+    def update(self, batch: TensorDictBase, *draws: Sequence[Tensor]) -> TensorDictBase:
         """Learn from a batch of transitions [B]; returns scalars to log.
 
-        With ``draws``, which are ``learner.draw(batch)``, it draws nothing, so that it may run in a
+        Given ``learner.draw(batch)`` as well, it draws nothing, so that it may run in a
         thread beside other learners; a CUDA graph draws for itself, and is left out then.
         """
-        scalars = self._step(batch) if draws is None else self.step(batch, draws)
+        scalars = self.step(batch, *draws) if draws else self._step(batch)
         self.ema.follow()  # counts in Python: no part of a CUDA graph
         return scalars
 
