@@ -86,7 +86,7 @@ def queue(config: DictConfig) -> list[Run]:
             filter(None, (name.replace(":", "-"), goal, method, f"seed{seed}"))
         )
         command = [str(HERE / "etl_sac.py"), *overrides]
-        runs.append(Run(name, goal or None, method, seed, path, command))
+        runs.append(Run(name, goal or None, method, seed, path, command, config.frames))
         validate(compose(overrides))  # every one of them, before the first begins
     return runs
 

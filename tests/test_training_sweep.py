@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,8 @@ def script(tmp_path: Path, text: str) -> list[str]:
 
 
 def small_run(tmp_path: Path, text: str) -> Run:
-    return Run("task", None, "method", 0, tmp_path / "out" / "one", script(tmp_path, text))
+    path = tmp_path / "out" / "one"
+    return Run("task", None, "method", 0, path, [*script(tmp_path, text), "lr=1"], frames=9)
 
 
 @pytest.mark.slow
@@ -86,17 +88,39 @@ def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
 def test_a_finished_run_is_left_alone(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     run.path.mkdir(parents=True)
-    (run.path / "summary.json").write_text("{}")
+    (run.path / "summary.json").write_text('{"learn": {"frames_charged": 9}}')
     sweep = Sweep([run], tmp_path / "out", jobs=1)
     for _ in sweep:
         pass
     assert sweep.status(run) == "finished" and run.starts == 0
 
 
+def test_a_run_that_ended_with_fewer_frames_goes_on(tmp_path):
+    run = small_run(tmp_path, "import sys; print(sys.argv[1:])")
+    run.path.mkdir(parents=True)
+    (run.path / "config.yaml").write_text("frames: 8")
+    (run.path / "summary.json").write_text('{"learn": {"frames_charged": 8}}')
+    sweep = Sweep([run], tmp_path / "out", jobs=1, attempts=1)
+    for _ in sweep:
+        pass
+    assert (run.path / "log.txt").read_text() == f"['resume={run.path}', 'frames=9']\n"
+
+
+def test_a_run_with_other_settings_is_not_taken_for_this_one(tmp_path):
+    run = small_run(tmp_path, "")
+    for _ in Sweep([run], tmp_path / "out", jobs=1, attempts=1):
+        pass
+    other = replace(run, command=[run.command[0], "lr=2"])
+    words = r"begun with other settings \(lr=1, lr=2\); give another out=FOLDER"
+    with pytest.raises(ValueError, match=words):
+        Sweep([other], tmp_path / "out", jobs=1)
+
+
 def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     (tmp_path / "out").mkdir()
-    row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "goal": "", "method": "method"}
+    row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "method": "method", "frames": "9"}
+    row["goal"] = ""
     other = row | {"seed": "7", "status": "unfinished"}
     lines = [COLUMNS, (row | {"status": "finished"}).values(), other.values()]
     text = "".join(",".join(line) + "\n" for line in lines)

@@ -26,6 +26,7 @@ from torchrl_etl.training.run_folder import RunFolder
 
 __all__ = ["Run", "Sweep"]
 
+SETTINGS = "settings.txt"
 KEY = ("task", "goal", "method", "seed")
 EARLIER_STAGES = ("explore", "play")
 
@@ -38,6 +39,7 @@ class Run:
         task, goal, method, seed: what is run; ``goal`` may be ``None``.
         path (Path): its run folder.
         command (sequence of str): begins the run, without ``run_dir``.
+        frames (int): its budget, also part of the command.
     """
 
     task: str
@@ -46,6 +48,7 @@ class Run:
     seed: int
     path: Path
     command: Sequence[str] = field(repr=False)
+    frames: int
     process: subprocess.Popen | None = field(default=None, repr=False)
     starts: int = 0
 
@@ -60,7 +63,32 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        return (self.path / "summary.json").is_file()
+        """Whether it ended, and not with a smaller budget than it has now."""
+        path = self.path / "summary.json"
+        if not path.is_file():
+            return False
+        return json.loads(path.read_text("utf-8"))["learn"]["frames_charged"] >= self.frames
+
+    @property
+    def settings(self) -> list[str]:
+        """What it is begun with, and cannot go on with otherwise."""
+        return [given for given in self.command[1:] if not given.startswith("frames=")]
+
+    def check_settings(self) -> None:
+        """Refuse to take a run with other settings for this one.
+
+        Raises:
+            ValueError: if it was begun with others.
+        """
+        path = self.path / SETTINGS
+        if not path.is_file():
+            return
+        begun = path.read_text("utf-8").splitlines()
+        if other := sorted(set(begun) ^ set(self.settings)):
+            raise ValueError(
+                f"{self.path} was begun with other settings ({', '.join(other)}); give another "
+                "out=FOLDER, or the settings that it was begun with."
+            )
 
     @property
     def is_busy(self) -> bool:
@@ -89,8 +117,11 @@ class Run:
         begun = (self.path / "config.yaml").is_file()
         where = f"resume={self.path}" if begun else f"run_dir={self.path}"
         script, *overrides = self.command
-        command = [sys.executable, script, where, *([] if begun else overrides)]
+        now = [f"frames={self.frames}"] if begun else overrides
+        command = [sys.executable, script, where, *now]
         self.path.mkdir(parents=True, exist_ok=True)
+        if not begun:
+            write_atomically(self.path / SETTINGS, "\n".join(self.settings))
         with (self.path / "log.txt").open("a", encoding="utf-8") as log:
             # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
             self.process = subprocess.Popen(
@@ -129,8 +160,9 @@ class Sweep:
     """Runs a queue with several processes at a time and keeps one table of all evaluations.
 
     A run that is finished is left alone, be it that only its rows in the table are left; one that
-    was begun goes on from its last checkpoint; one that fails is tried again, ``attempts`` times
-    in all. However the queue itself ends, its runs end with it or before.
+    was begun, or that ended with a smaller budget, goes on from its last checkpoint; one that fails
+    is tried again, ``attempts`` times in all. However the queue itself ends, its runs end with it
+    or before.
 
     Args:
         runs (sequence of Run): what to run, in this order.
@@ -141,10 +173,13 @@ class Sweep:
         attempts (int): starts of one run, at most. Default: 3.
 
     Raises:
+        ValueError: if one of the runs was begun with other settings.
         RuntimeError: if another queue works in this folder.
     """
 
     def __init__(self, runs: Sequence[Run], folder: Path, *, jobs: int, attempts: int = 3) -> None:
+        for run in runs:
+            run.check_settings()
         self.runs, self.folder, self.jobs, self.attempts = runs, Path(folder), jobs, attempts
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.folder / ".lock")
@@ -156,7 +191,8 @@ class Sweep:
             ) from None
         # Rows of earlier queues, perhaps of other machines: tables travel, run folders do not.
         self._earlier = self._read()
-        self._done = {_key(row) for row in self._earlier if row["status"] == "finished"}
+        ended = (row for row in self._earlier if row["status"] == "finished")
+        self._done = {_key(row): float(row["frames"]) for row in ended}  # the last row's stay
 
     def __iter__(self) -> Iterator[Sequence[Run]]:
         """Work through the queue; yields about once a second, for a display."""
@@ -183,7 +219,7 @@ class Sweep:
         """waiting, running, finished, failed, or, of one not in this queue's hands, unfinished."""
         if run.process is not None and run.process.poll() is None:
             return "running"
-        if run.is_finished or run.key in self._done:
+        if run.is_finished or self._done.get(run.key, -math.inf) >= run.frames:
             return "finished"
         return "failed" if run.starts >= self.attempts else "waiting"
 
