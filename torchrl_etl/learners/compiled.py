@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from functools import wraps
-from threading import Lock
+from threading import Lock, current_thread, main_thread
 from typing import Any
 
 import torch
@@ -115,7 +115,8 @@ def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _options() -> dict[str, Any]:
-    """What makes inductor (torch 2.13) draw as PyTorch does, and compile where a path has a space.
+    """What makes inductor (torch 2.13) draw as PyTorch does, leave Python to other threads, and
+    compile where a path has a space.
 
     It hands the folder of PyTorch's libraries, its cache and its precompiled headers to a shell
     without quotes.
@@ -131,6 +132,10 @@ def _options() -> dict[str, Any]:
     if _is_split(TORCH_LIB_PATH):
         # The symbols that a kernel needs are those of the process, which has loaded PyTorch.
         options["aot_inductor.link_libtorch"] = False
+    elif current_thread() is not main_thread():
+        # Inductor's kernels keep Python's lock unless the calls between them are in C++ too, which
+        # needs the library, takes twice the time to compile and gives a thread by itself little.
+        options["cpp_wrapper"] = True
     return options
 
 
