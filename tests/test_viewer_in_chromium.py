@@ -73,11 +73,21 @@ def browser(page) -> Iterator[tuple]:
         chromium.close()
 
 
-def wait(until: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE
+def wait(until: Callable[[], bool], seconds: float = PATIENCE) -> bool:
+    deadline = time.monotonic() + seconds
     while not until() and time.monotonic() < deadline:
         time.sleep(0.05)
     return until()
+
+
+def press(tab, name: str, until: Callable[[], bool]) -> bool:
+    """Click, and once more if nothing came of it: viser 1.1 has lost a click in about a thousand,
+    and a person would."""
+    for _ in range(2):
+        tab.get_by_role("button", name=name).dispatch_event("click")
+        if wait(until, PATIENCE / 3):
+            return True
+    return False
 
 
 def test_the_page_loads_and_names_the_muscles_without_an_error(browser, page):
@@ -101,12 +111,9 @@ def test_a_slider_moves_the_muscle_that_it_names(browser, page):
 def test_play_advances_the_episode_until_pause(browser, page):
     tab, faults = browser
     steps = page.session.steps
-    tab.get_by_role("button", name="Play").dispatch_event("click")
-    assert wait(lambda: page.session.steps > steps + 10)
-    tab.get_by_role("button", name="Pause").dispatch_event("click")
-    assert wait(lambda: not page.session.playing)
-    tab.get_by_role("button", name="Reset").dispatch_event("click")
-    assert wait(lambda: page.session.steps == 0)
+    assert press(tab, "Play", lambda: page.session.steps > steps + 10)
+    assert press(tab, "Pause", lambda: not page.session.playing)
+    assert press(tab, "Reset", lambda: page.session.steps == 0)
     assert faults == []
 
 
