@@ -33,7 +33,9 @@ def main() -> None:
         with one_sentence(OSError):
             config = OmegaConf.load(run / "config.yaml")
         folder = RunFolder(run, config)
-        start = folder.versions[-1]
+        if not (starts := folder.versions):
+            parser.error(f"{run} does not say what it was made with; name a run that has begun.")
+        start = starts[-1]
         row = {"task": config.env, "method": config.method.name, "seed": config.seed}
         for frames, mean in stretches(*folder.series("learn/return"), arguments.stretch):
             row |= {"frames": frames, "return": round(mean, 1)}

@@ -212,6 +212,11 @@ def test_a_composite_action_under_one_key_gives_the_numbers_of_torchrls_loss() -
     assert_same_numbers(composite_actor(), critic, data)
 
 
+def test_counted_entropy_of_another_actor_than_a_tanh_gaussian_is_refused() -> None:
+    with pytest.raises(ValueError, match="counted is 1, but the actor is no tanh-Gaussian"):
+        LeanSACLoss(composite_actor(), make_critic({"observation": 3, "action": 2}), counted=1)
+
+
 def test_a_composite_action_under_several_keys_is_refused() -> None:
     actor = composite_actor(name_map={"left": "left", "right": "right"})
     with pytest.raises(ValueError, match=r"The actor samples \['left', 'right'\]"):

@@ -18,7 +18,7 @@ from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.functional import categorical_cross_entropy, categorical_mean, project_categorical
 from torchrl_etl.objectives.checks import check_parts
@@ -63,8 +63,9 @@ class LeanSACLoss(SACLoss):
         TypeError: if actor or critic is of another class, or a ``value_network`` or
             ``skip_done_states`` is given.
         ValueError: for an unknown reduction or ``loss_function``, a support that is not evenly
-            spaced and ascending, an actor that samples several keys, or a critic of several
-            outputs none of which is the ``state_action_value``.
+            spaced and ascending, ``counted`` with an actor that is no tanh-Gaussian, an
+            actor that samples several keys, or a critic of several outputs none of which is the
+            ``state_action_value``.
 
     Examples:
         >>> import torch
@@ -108,6 +109,14 @@ class LeanSACLoss(SACLoss):
                 f"The actor samples {sampled}; the parts of a composite action must lie under one "
                 "key: give it out_keys=['action'] and its distribution no name_map."
             )
+        if counted is not None:
+            check_integer(1, counted=counted)
+            kind = actor_network[-1].distribution_class
+            if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
+                raise ValueError(
+                    f"counted is {counted}, but the actor is no tanh-Gaussian; leave counted out, "
+                    "or give the actor TanhNormal as its distribution."
+                )
         check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
         check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
         for name in ("value_network", "skip_done_states"):
