@@ -18,6 +18,8 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
+from torchrl_etl.learners.products import faster_products
+
 __all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
@@ -98,7 +100,10 @@ def _graph(
     with torch.random.fork_rng():  # a compiler draws numbers of its own
         # As under torch.compile, nothing looks at values to check them.
         with torch.compiler._compile_session_context():
-            traced = make_fx(flat, _allow_non_fake_inputs=True)(*stand_ins)
+            trace = make_fx(
+                flat, decomposition_table=faster_products(), _allow_non_fake_inputs=True
+            )
+            traced = trace(*stand_ins)
         with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(_options()):
             run = _inductor.compile(traced, stand_ins)
 

@@ -1,0 +1,62 @@
+"""Products by oneDNN: the numbers of PyTorch's, forwards and backwards, however matrices lie."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.learners.products import faster_products, product
+
+
+@pytest.fixture(params=["AVX512", "AVX2"])
+def capability(request, monkeypatch):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: request.param)
+    faster_products.cache_clear()
+    yield request.param
+    faster_products.cache_clear()
+
+
+def layouts(rows: int, columns: int) -> dict[str, Tensor]:
+    return {
+        "dense": torch.randn(rows, columns),
+        "transposed": torch.randn(columns, rows).t(),
+        "columns of a larger one": torch.randn(rows, columns + 5)[:, 2:-3],
+    }
+
+
+@pytest.mark.parametrize("bias", [None, torch.linspace(-1, 1, 24)])
+@pytest.mark.parametrize("left", layouts(1, 1))
+@pytest.mark.parametrize("right", layouts(1, 1))
+def test_a_product_has_the_numbers_of_pytorch(left, right, bias):
+    a, b = layouts(32, 20)[left], layouts(20, 24)[right]
+    expected = a @ b if bias is None else torch.addmm(bias, a, b)
+    torch.testing.assert_close(product(a, b, bias), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_only_with_avx_512_are_products_replaced(capability):
+    assert bool(faster_products()) == (capability == "AVX512")
+
+
+@pytest.mark.slow
+def test_a_compiled_graph_of_large_and_small_products_has_the_same_gradients(capability):
+    torch.manual_seed(0)
+    features = torch.randn(64, 33)
+    weights = [
+        torch.randn(n, m).div(m**0.5).requires_grad_() for n, m in ((40, 66), (40, 40), (1, 40))
+    ]
+
+    def gradients(features: Tensor) -> list[Tensor]:
+        first, second, last = weights
+        # Some columns of a weight, as where the rest of them meets what a batch shares.
+        hidden = torch.nn.functional.linear(features, first[:, 3:36], last[0]).tanh()
+        value = torch.nn.functional.linear(hidden @ second, last)
+        return list(torch.autograd.grad(value.square().mean(), weights))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # of an update that cannot be compiled
+        fast = compiled(gradients)(features)
+    torch.testing.assert_close(fast, gradients(features), rtol=1e-4, atol=1e-6)

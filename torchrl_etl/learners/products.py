@@ -1,0 +1,72 @@
+"""Matrix products of a compiled update by oneDNN, where PyTorch's own are slower.
+
+PyTorch multiplies by MKL, which leaves AVX-512 of AMD's processors alone (torch 2.13): half of the
+speed of oneDNN, which PyTorch has too and gives no function for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["faster_products"]
+
+_SMALLEST = 16  # of either side; MKL is faster for a critic's single output
+
+
+@torch.library.custom_op("torchrl_etl::product", mutates_args=())
+def product(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
+    """a [m, k] times b [k, n], and the bias [n] added, as :func:`torch.addmm` does."""
+    return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "none", [], "")
+
+
+@product.register_fake
+def _(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
+    return a.new_empty(a.shape[0], b.shape[1])
+
+
+@cache
+def faster_products() -> dict[Any, Callable[..., Any]]:
+    """What :func:`~torch.fx.experimental.proxy_tensor.make_fx` is to trace in place of products.
+
+    Empty where oneDNN was not found to be faster: without AVX-512 they are level.
+    """
+    capability = torch.backends.cpu.get_cpu_capability()
+    if capability != "AVX512" or not torch.backends.mkldnn.is_available():
+        return {}
+    from torch._inductor.lowering import fallback_handler, permute, register_lowering
+
+    linear = torch.ops.mkldnn._linear_pointwise.default
+    # Inductor's own way for this operation is for weights that never change.
+    call = fallback_handler(linear, add_to_fallback_set=False)
+
+    @register_lowering(torch.ops.torchrl_etl.product.default, type_promotion_kind=None)
+    def lower(a: Any, b: Any, bias: Any) -> Any:
+        return call(a, permute(b, [1, 0]), bias, "none", [], "")
+
+    return {torch.ops.aten.mm.default: _mm, torch.ops.aten.addmm.default: _addmm}
+
+
+def _mm(a: Tensor, b: Tensor) -> Tensor:
+    return torch.ops.torchrl_etl.product(a, _dense(b), None) if _pays(a, b) else NotImplemented
+
+
+def _addmm(bias: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor:
+    if beta == alpha == 1 and bias.shape == b.shape[1:] and _pays(a, b):
+        return torch.ops.torchrl_etl.product(a, _dense(b), bias)
+    return NotImplemented
+
+
+def _pays(a: Tensor, b: Tensor) -> bool:
+    plain = a.dtype == torch.float32 and a.device.type == "cpu"
+    return plain and min(*a.shape, b.shape[1]) >= _SMALLEST
+
+
+def _dense(b: Tensor) -> Tensor:
+    """oneDNN has no kernel for some columns of a larger matrix, and then takes a thousand times as
+    long."""
+    return b if b.is_contiguous() or b.t().is_contiguous() else b.contiguous()
