@@ -1,16 +1,20 @@
 """The floor of an update: the time of its matrix products alone.
 
-``torch.mm`` takes it for exactly the products of an update, each on tensors of its own, without a
-gradient where none is needed.
+What compiled updates multiply by (``torch.mm``, or oneDNN's operation) takes it for exactly the
+products of an update, each on tensors of its own, without a gradient where none is needed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from torchrl_etl.learners.products import by_onednn, faster_products
 
 __all__ = ["floor", "products", "sac_products", "stage_products"]
 
@@ -59,13 +63,17 @@ def stage_products(cfg: Any, name: str, observation_dim: int, action_dim: int) -
 
 
 def floor(shapes: list[Shape]) -> Callable[[], object]:
-    operands = [
-        (torch.randn(rows, inner), torch.randn(inner, columns), torch.empty(rows, columns))
-        for rows, inner, columns in shapes
-    ]
+    calls = [product(torch.randn(m, k), torch.randn(k, n)) for m, k, n in shapes]
 
     def run() -> None:
-        for left, right, out in operands:
-            torch.mm(left, right, out=out)
+        for call in calls:
+            call()
 
     return run
+
+
+def product(left: Tensor, right: Tensor) -> Callable[[], Tensor]:
+    if faster_products() and by_onednn(left, right):
+        linear = torch.ops.mkldnn._linear_pointwise.default
+        return partial(linear, left, right.t(), None, "none", [], "")
+    return partial(torch.mm, left, right, out=torch.empty(len(left), right.shape[1]))
