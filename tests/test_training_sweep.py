@@ -111,6 +111,8 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(tmp_path):
     for _ in Sweep([run], tmp_path / "out", jobs=1, attempts=1):
         pass
     other = replace(run, command=[run.command[0], "lr=2"])
+    Sweep([other], tmp_path / "out", jobs=1).stop()  # it failed before it began: a typo, mended
+    (run.path / "config.yaml").write_text("frames: 9")
     words = r"begun with other settings \(lr=1, lr=2\); give another out=FOLDER"
     with pytest.raises(ValueError, match=words):
         Sweep([other], tmp_path / "out", jobs=1)

@@ -70,6 +70,10 @@ class Run:
         return json.loads(path.read_text("utf-8"))["learn"]["frames_charged"] >= self.frames
 
     @property
+    def has_begun(self) -> bool:
+        return (self.path / "config.yaml").is_file()
+
+    @property
     def settings(self) -> list[str]:
         """What it is begun with, and cannot go on with otherwise."""
         return [given for given in self.command[1:] if not given.startswith("frames=")]
@@ -81,10 +85,8 @@ class Run:
             ValueError: if it was begun with others.
         """
         path = self.path / SETTINGS
-        if not path.is_file():
-            return
-        begun = path.read_text("utf-8").splitlines()
-        if other := sorted(set(begun) ^ set(self.settings)):
+        begun = path.read_text("utf-8").splitlines() if path.is_file() else self.settings
+        if self.has_begun and (other := sorted(set(begun) ^ set(self.settings))):
             raise ValueError(
                 f"{self.path} was begun with other settings ({', '.join(other)}); give another "
                 "out=FOLDER, or the settings that it was begun with."
@@ -100,9 +102,8 @@ class Run:
         """What it logged, once it has begun."""
         from omegaconf import OmegaConf
 
-        begun = (self.path / "config.yaml").is_file()
         # Its series are read every second; its configuration, 30 ms to parse, is not needed.
-        return RunFolder(self.path, OmegaConf.create()) if begun else None
+        return RunFolder(self.path, OmegaConf.create()) if self.has_begun else None
 
     @cached_property
     def episodes(self) -> int:
@@ -114,14 +115,14 @@ class Run:
     def start(self, environ: Mapping[str, str]) -> None:
         """Begin, or go on where an earlier start was stopped."""
         self.starts += 1
-        begun = (self.path / "config.yaml").is_file()
-        where = f"resume={self.path}" if begun else f"run_dir={self.path}"
         script, *overrides = self.command
-        now = [f"frames={self.frames}"] if begun else overrides
-        command = [sys.executable, script, where, *now]
         self.path.mkdir(parents=True, exist_ok=True)
-        if not begun:
+        if self.has_begun:
+            overrides = [f"resume={self.path}", f"frames={self.frames}"]
+        else:
+            overrides = [f"run_dir={self.path}", *overrides]
             write_atomically(self.path / SETTINGS, "\n".join(self.settings))
+        command = [sys.executable, script, *overrides]
         with (self.path / "log.txt").open("a", encoding="utf-8") as log:
             # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
             self.process = subprocess.Popen(
