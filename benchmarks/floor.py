@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_etl.learners.products import by_onednn, faster_products
+from torchrl_etl.learners.products import by_onednn, faster_products, multiply
 
 __all__ = ["floor", "products", "sac_products", "stage_products"]
 
@@ -74,6 +74,5 @@ def floor(shapes: list[Shape]) -> Callable[[], object]:
 
 def product(left: Tensor, right: Tensor) -> Callable[[], Tensor]:
     if faster_products() and by_onednn(left, right):
-        linear = torch.ops.mkldnn._linear_pointwise.default
-        return partial(linear, left, right.t(), None, "none", [], "")
+        return partial(multiply, left, right, None)
     return partial(torch.mm, left, right, out=torch.empty(len(left), right.shape[1]))

@@ -73,7 +73,7 @@ def queue(config: DictConfig) -> list[Run]:
     runs = []
     for seed, task, method in product(config.seeds, config.tasks, config.methods):
         name, goal = split_goal(str(task))
-        overrides = [f"env={name}", f"method={method}", f"seed={seed}", f"frames={config.frames}"]
+        overrides = [f"env={name}", f"method={method}", f"seed={seed}"]
         overrides += [f"goal={goal}"] if goal else []
         overrides += [
             "threads=1",
@@ -87,7 +87,9 @@ def queue(config: DictConfig) -> list[Run]:
         )
         command = [str(HERE / "etl_sac.py"), *overrides]
         runs.append(Run(name, goal or None, method, seed, path, command, config.frames))
-        validate(compose(overrides))  # every one of them, before the first begins
+        validate(
+            compose([*overrides, f"frames={config.frames}"])
+        )  # every one of them, before the first begins
     return runs
 
 
@@ -131,11 +133,10 @@ class Display:
         return table
 
     def time_left(self, run: Run, done: int) -> str:
-        total = int(next(o for o in run.command if o.startswith("frames=")).partition("=")[2])
         first, since = self.begun.setdefault(run.name, (done, time.monotonic()))
         if done <= first:
             return "?"
-        minutes = (total - done) * (time.monotonic() - since) / (done - first) / 60
+        minutes = (run.frames - done) * (time.monotonic() - since) / (done - first) / 60
         return f"{minutes:.0f} min" if minutes >= 1 else "< 1 min"
 
 

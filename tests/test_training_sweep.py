@@ -85,10 +85,11 @@ def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
     assert (run.path / "log.txt").read_text().count("it broke") == 2
 
 
-def test_a_finished_run_is_left_alone(tmp_path):
+@pytest.mark.parametrize("summary", ["{}", '{"learn": {"frames_charged": 9}}'])
+def test_a_finished_run_is_left_alone(tmp_path, summary):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     run.path.mkdir(parents=True)
-    (run.path / "summary.json").write_text('{"learn": {"frames_charged": 9}}')
+    (run.path / "summary.json").write_text(summary)
     sweep = Sweep([run], tmp_path / "out", jobs=1)
     for _ in sweep:
         pass

@@ -73,19 +73,18 @@ def browser(page) -> Iterator[tuple]:
         chromium.close()
 
 
-def wait(until: Callable[[], bool], seconds: float = PATIENCE) -> bool:
-    deadline = time.monotonic() + seconds
+def wait(until: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + PATIENCE
     while not until() and time.monotonic() < deadline:
         time.sleep(0.05)
     return until()
 
 
 def press(tab, name: str, until: Callable[[], bool]) -> bool:
-    """Click, and once more if nothing came of it: viser 1.1 has lost a click in about a thousand,
-    and a person would."""
+    """Click, and once more if nothing came of it, as a person would: viser 1.1 has lost a click."""
     for _ in range(2):
         tab.get_by_role("button", name=name).dispatch_event("click")
-        if wait(until, PATIENCE / 3):
+        if wait(until):
             return True
     return False
 

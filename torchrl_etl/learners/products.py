@@ -13,15 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["by_onednn", "faster_products"]
+__all__ = ["by_onednn", "faster_products", "multiply"]
 
 _SMALLEST = 16  # of either side; MKL is faster for a critic's single output
 
 
-@torch.library.custom_op("torchrl_etl::product", mutates_args=())
-def product(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
+def multiply(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
     """a [m, k] times b [k, n], and the bias [n] added, as :func:`torch.addmm` does."""
     return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "none", [], "")
+
+
+product = torch.library.custom_op("torchrl_etl::product", multiply, mutates_args=())
 
 
 @product.register_fake
@@ -33,7 +35,7 @@ def _(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
 def faster_products() -> dict[Any, Callable[..., Any]]:
     """What :func:`~torch.fx.experimental.proxy_tensor.make_fx` is to trace in place of products.
 
-    Empty where oneDNN was not found to be faster: without AVX-512 they are level.
+    Empty where oneDNN was not found to be faster: without AVX-512 they are about level.
     """
     capability = torch.backends.cpu.get_cpu_capability()
     if capability != "AVX512" or not torch.backends.mkldnn.is_available():

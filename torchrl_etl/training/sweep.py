@@ -38,8 +38,8 @@ class Run:
     Attributes:
         task, goal, method, seed: what is run; ``goal`` may be ``None``.
         path (Path): its run folder.
-        command (sequence of str): begins the run, without ``run_dir``.
-        frames (int): its budget, also part of the command.
+        command (sequence of str): begins the run, without ``run_dir`` and ``frames``.
+        frames (int): its budget.
     """
 
     task: str
@@ -67,16 +67,12 @@ class Run:
         path = self.path / "summary.json"
         if not path.is_file():
             return False
-        return json.loads(path.read_text("utf-8"))["learn"]["frames_charged"] >= self.frames
+        learned = json.loads(path.read_text("utf-8")).get("learn")  # none with stage=explore
+        return learned is None or learned["frames_charged"] >= self.frames
 
     @property
     def has_begun(self) -> bool:
         return (self.path / "config.yaml").is_file()
-
-    @property
-    def settings(self) -> list[str]:
-        """What it is begun with, and cannot go on with otherwise."""
-        return [given for given in self.command[1:] if not given.startswith("frames=")]
 
     def check_settings(self) -> None:
         """Refuse to take a run with other settings for this one.
@@ -84,9 +80,9 @@ class Run:
         Raises:
             ValueError: if it was begun with others.
         """
-        path = self.path / SETTINGS
-        begun = path.read_text("utf-8").splitlines() if path.is_file() else self.settings
-        if self.has_begun and (other := sorted(set(begun) ^ set(self.settings))):
+        path, asked = self.path / SETTINGS, self.command[1:]
+        begun = path.read_text("utf-8").splitlines() if path.is_file() else asked
+        if self.has_begun and (other := sorted(set(begun) ^ set(asked))):
             raise ValueError(
                 f"{self.path} was begun with other settings ({', '.join(other)}); give another "
                 "out=FOLDER, or the settings that it was begun with."
@@ -115,14 +111,14 @@ class Run:
     def start(self, environ: Mapping[str, str]) -> None:
         """Begin, or go on where an earlier start was stopped."""
         self.starts += 1
-        script, *overrides = self.command
+        script, *settings = self.command
         self.path.mkdir(parents=True, exist_ok=True)
         if self.has_begun:
-            overrides = [f"resume={self.path}", f"frames={self.frames}"]
+            where, settings = f"resume={self.path}", []
         else:
-            overrides = [f"run_dir={self.path}", *overrides]
-            write_atomically(self.path / SETTINGS, "\n".join(self.settings))
-        command = [sys.executable, script, *overrides]
+            where = f"run_dir={self.path}"
+            write_atomically(self.path / SETTINGS, "\n".join(settings))
+        command = [sys.executable, script, where, f"frames={self.frames}", *settings]
         with (self.path / "log.txt").open("a", encoding="utf-8") as log:
             # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
             self.process = subprocess.Popen(
@@ -193,7 +189,7 @@ class Sweep:
         # Rows of earlier queues, perhaps of other machines: tables travel, run folders do not.
         self._earlier = self._read()
         ended = (row for row in self._earlier if row["status"] == "finished")
-        self._done = {_key(row): float(row["frames"]) for row in ended}  # the last row's stay
+        self._done = {_key(row): float(row["frames"]) for row in ended}  # of its last row
 
     def __iter__(self) -> Iterator[Sequence[Run]]:
         """Work through the queue; yields about once a second, for a display."""
