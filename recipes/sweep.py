@@ -87,9 +87,8 @@ def queue(config: DictConfig) -> list[Run]:
         )
         command = [str(HERE / "etl_sac.py"), *overrides]
         runs.append(Run(name, goal or None, method, seed, path, command, config.frames))
-        validate(
-            compose([*overrides, f"frames={config.frames}"])
-        )  # every one of them, before the first begins
+        # Every one of them, before the first begins.
+        validate(compose([*overrides, f"frames={config.frames}"]))
     return runs
 
 
