@@ -2,11 +2,13 @@
 
     python benchmarks/seeds.py
     python benchmarks/seeds.py --seeds 8 --compile
+    python benchmarks/seeds.py --seeds 16 --compile --device cuda
 
-One thread and CPU time; both take turns in blocks of updates. ``explore`` and ``learn`` are the
-recipe's stages, which make their updates as in training, 16 earned at a time: sampling, each seed's
-random numbers and its own state of the generators are included. A ratio is to the same seeds one
-after another.
+One thread and CPU time, or with ``--device cuda`` the time until the GPU is done; both take turns
+in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make their updates as
+in training, 16 earned at a time: sampling, each seed's random numbers and its own state of the
+generators are included. A ratio is to the same seeds one after another; times the number of seeds,
+it is to one of them alone.
 """
 
 from __future__ import annotations
@@ -31,15 +33,22 @@ from torchrl_etl.training.together import together
 from torchrl_etl.training.work import Work
 
 
-def filled(seed: int, name: str, compile: bool, env: str) -> Stage:
+def filled(seed: int, name: str, *overrides: str) -> Stage:
     """A stage as the recipe builds it, its buffer filled."""
-    overrides = (f"env={env}", f"seed={seed}", f"compile={str(compile).lower()}", "threads=1")
-    experiment = Experiment(recipe(*overrides, "run_dir=unused"))
+    experiment = Experiment(recipe(*overrides, f"seed={seed}", "threads=1", "run_dir=unused"))
     stage = Explorer(experiment.context).stage if name == "explore" else experiment.method.stage()
     spec, d = experiment.context.spec, experiment.config.num_synergies
     stage.prefill(transitions(spec.observation_dim, spec.action_dim, d))
     stage.progress.owed = 0.0
     return stage
+
+
+def seconds() -> float:
+    """CPU time, or where there is a GPU at work, the time at which that is done."""
+    if not torch.cuda.is_initialized():
+        return time.process_time()
+    torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, list[float]]:
@@ -49,24 +58,24 @@ def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, lis
     the first seed therefore looks at the clock, and has the seeds updated one after another
     meanwhile.
     """
-    seconds: dict[str, list[float]] = {"one_by_one": [], "together": []}
+    taken: dict[str, list[float]] = {"one_by_one": [], "together": []}
 
     def first() -> Work[None]:
         for _ in range(repeats + 1):
-            start = time.process_time()
+            start = seconds()
             for stage in stages:
                 train(stage, block, at_once=AT_ONCE)
-            middle = time.process_time()
+            middle = seconds()
             yield from training(stages[0], block, at_once=AT_ONCE)
-            seconds["one_by_one"].append(middle - start)
-            seconds["together"].append(time.process_time() - middle)
+            taken["one_by_one"].append(middle - start)
+            taken["together"].append(seconds() - middle)
 
     others = [training(stage, (repeats + 1) * block, at_once=AT_ONCE) for stage in stages[1:]]
     for result in together([first(), *others], joint=True):
         if isinstance(result, BaseException):
             raise result
     updates = block * len(stages)
-    return {name: [1e3 * each / updates for each in values[1:]] for name, values in seconds.items()}
+    return {name: [1e3 * each / updates for each in values[1:]] for name, values in taken.items()}
 
 
 def main() -> None:
@@ -78,15 +87,16 @@ def main() -> None:
         "--block", type=int, default=1, help=f"how often {AT_ONCE} updates are measured at a time"
     )
     parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     quiet_torchrl()
     torch.set_num_threads(1)
 
-    more = {"seeds": arguments.seeds, "compile": arguments.compile}
+    more = {name: getattr(arguments, name) for name in ("seeds", "compile", "device")}
+    overrides = [f"env={arguments.env}", f"device={arguments.device}"]
+    overrides += [f"compile={str(arguments.compile).lower()}"]
     for name in ("explore", "learn"):
-        stages = [
-            filled(seed, name, arguments.compile, arguments.env) for seed in range(arguments.seeds)
-        ]
+        stages = [filled(seed, name, *overrides) for seed in range(arguments.seeds)]
         values = measured(stages, arguments.repeats, AT_ONCE * arguments.block)
         other = values["one_by_one"]
         line("seeds", f"one_by_one/{name}", "ms", other, **more)
