@@ -133,8 +133,8 @@ class VectorCollector(Collector):
         self._policy_on_arrays.refresh()
         carrier = self._carrier
         known = {*self.env.observation_keys, *self.env.state_keys, *self.env.done_keys}
-        now: Arrays = {key: carrier[key].numpy() for key in known}
-        now["collector", "traj_ids"] = carrier["collector", "traj_ids"].numpy()
+        now: Arrays = {key: carrier[key].numpy(force=True) for key in known}
+        now["collector", "traj_ids"] = carrier["collector", "traj_ids"].numpy(force=True)
         rows: dict[NestedKey, list[np.ndarray]] = defaultdict(list)
         for _ in range(self.frames_per_batch):
             written, after = self._step(now)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import CudaGraphModule
+from tensordict.nn.functional_modules import _exclude_td_from_pytree
 from torch import Tensor, _inductor
 from torch._guards import TracingContext, tracing
 from torch._subclasses import FakeTensorMode
@@ -116,7 +117,9 @@ def _graph(
 
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
     """Record what a function of a tensordict does on the GPU and play it back, as one launch."""
-    return CudaGraphModule(function, in_keys=[], out_keys=[], warmup=5)
+    # It takes TensorDicts out of PyTree for good (tensordict 0.14.3), unless they are not in it.
+    with _exclude_td_from_pytree():
+        return CudaGraphModule(function, in_keys=[], out_keys=[], warmup=5)
 
 
 def _options() -> dict[str, Any]:
