@@ -11,6 +11,7 @@ from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
 from torchrl_etl.learners import InThreads, SACLearner, SideBySide
+from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.learners.side_by_side import stacked
 from torchrl_etl.modules import make_critic
@@ -28,13 +29,6 @@ MAKERS = {
     "stage 1": lambda *settings: explorer(*settings).stage,
     "stage 1, METRA": lambda *settings: explorer("exploration=metra", *settings).stage,
 }
-
-
-class Descent(torch.optim.SGD):
-    def step_along(self, gradients):
-        for parameter, gradient in zip(self.param_groups[0]["params"], gradients, strict=True):
-            parameter.grad = gradient
-        self.step()
 
 
 def draws(group, batches):
@@ -96,8 +90,10 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
         fill(one)
         other.learner.objective.load_state_dict(one.learner.objective.state_dict())
         other.learner.ema.load_state_dict(one.learner.ema.state_dict())
-    for stage in (*ours, *theirs):  # Adam's first steps make a sign of rounding
-        stage.learner.optimizer = Descent(stage.learner.parameters, lr=1e-2)
+    for stage in (*ours, *theirs):  # with a small eps Adam's first steps make a sign of rounding
+        stage.learner.optimizer = GradientAdam(
+            stage.learner.parameters, lr=1e-2, eps=1.0, fused=True
+        )
     starts = [snapshot(stage.learner.ema) for stage in theirs]
     group = SideBySide([stage.learner for stage in ours])
     for _ in range(3):

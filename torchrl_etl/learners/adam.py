@@ -48,9 +48,10 @@ class GradientAdam(Adam):
             return
         for group, at, (parameters, *moments, steps) in self._walked:
             beta1, beta2 = group["betas"]
+            own = [gradients[i] for i in at]
             adam(
                 parameters,
-                [gradients[i] for i in at],
+                [_laid_out(*each) for each in zip(own, parameters, strict=True)],
                 *moments,
                 [],
                 steps,
@@ -64,7 +65,7 @@ class GradientAdam(Adam):
     def step_once(self, gradients: Sequence[Tensor | None]) -> None:
         """The same by Adam's own step, whichever are ``None``."""
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            parameter.grad = gradient
+            parameter.grad = None if gradient is None else _laid_out(gradient, parameter)
         self.step()
         self.zero_grad()
 
@@ -83,3 +84,11 @@ class GradientAdam(Adam):
             kept = [[state[key] for state in states] for key in ("exp_avg", "exp_avg_sq", "step")]
             if own:
                 self._walked.append((group, at, [own, *kept]))
+
+
+def _laid_out(gradient: Tensor, parameter: Tensor) -> Tensor:
+    """In memory as the parameter is: fused Adam (torch 2.13) takes no notice of strides on a CPU,
+    and refuses others on a GPU."""
+    if gradient.stride() == parameter.stride():
+        return gradient
+    return torch.empty_like(parameter).copy_(gradient)
