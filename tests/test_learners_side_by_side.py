@@ -31,6 +31,12 @@ MAKERS = {
 }
 
 
+def in_one(group, batches):
+    """What the pass over all of them reads, for one update."""
+    given = [[each] for each in draws(group, batches)]
+    return stacked([batch.unsqueeze(0) for batch in batches], given)[0]
+
+
 def draws(group, batches):
     """The random numbers of each learner, of a generator that was seeded with its seed."""
     drawn = []
@@ -46,7 +52,7 @@ def assert_gradients_are_those_of_each(learners, batches):
         torch.manual_seed(seed)
         alone.append(learner.gradients(batch))
     group = SideBySide(learners)
-    together, scalars = group.gradients(stacked(batches, draws(group, batches)))
+    together, scalars = group.gradients(in_one(group, batches))
     for (expected, logged), found, log in zip(alone, together, scalars.unbind(0), strict=True):
         assert len(found) == len(expected)
         for one, other in zip(expected, found, strict=True):
@@ -121,7 +127,7 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
         stage.close()
     batches = [stage.sample() for stage in stages]
     group = SideBySide([stage.learner for stage in stages])
-    inputs = stacked(batches, draws(group, batches))
+    inputs = in_one(group, batches)
     with torch.no_grad():  # each its own, also of what is no network
         stages[1].learner.objective.sac.log_alpha += 1
         if (normalizer := stages[1].learner.objective.normalizer) is not None:

@@ -13,7 +13,6 @@ from torchrl.envs.utils import exploration_type
 
 from tests.configs import tiny
 from tests.runs import numbers
-from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import Objective, SACLearner, SideBySide, compiled
@@ -32,15 +31,14 @@ def work(run: Path, seed: int, *settings: str, stop: StopOnSignal | None = None)
 
 def one_after_another(group: SideBySide, batches, draws) -> list:
     """The same updates with the same random numbers, each by itself: without rounding otherwise."""
-    scalars = []
-    for learner, batch, given in zip(group.learners, batches, draws, strict=True):
-        with given_draws(given):
-            scalars.append(learner.update(batch))
-    return scalars
+    return [
+        learner.updates(own, given)
+        for learner, own, given in zip(group.learners, batches, draws, strict=True)
+    ]
 
 
 def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(SideBySide, "update", one_after_another)
+    monkeypatch.setattr(SideBySide, "updates", one_after_another)
     summaries = together([work(tmp_path / f"{seed}", seed) for seed in (0, 1)])
     for seed, summary in enumerate(summaries):
         assert summary["seed"] == seed and summary["learn"]["frames_charged"] >= 416

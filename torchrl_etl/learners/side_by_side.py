@@ -75,10 +75,8 @@ class SideBySide:
         Returns:
             list of TensorDictBase: the scalars of each.
         """
-        scalars = self._step(stacked(batches, draws))
-        for learner in self.learners:
-            learner.ema.follow()
-        return list(scalars.unbind(0))
+        one = self.updates([batch.unsqueeze(0) for batch in batches], [[each] for each in draws])
+        return [scalars[0] for scalars in one]
 
     def updates(
         self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Sequence[Tensor]]]
@@ -88,9 +86,12 @@ class SideBySide:
         Returns:
             list of TensorDictBase: the scalars [k] of each.
         """
-        turns = zip(zip(*batches, strict=True), zip(*draws, strict=True), strict=True)
-        scalars = [self.update(*turn) for turn in turns]
-        return [torch.stack(list(own)) for own in zip(*scalars, strict=True)]
+        scalars = []
+        for inputs in stacked(batches, draws):
+            scalars.append(self._step(inputs))
+            for learner in self.learners:
+                learner.ema.follow()
+        return list(torch.stack(scalars).unbind(1))
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Everything of an update that runs on the device; returns scalars [seeds]."""
@@ -127,8 +128,19 @@ class SideBySide:
         return [flat[i : i + count] for i in range(0, len(flat), count)], scalars.detach()
 
 
-def stacked(batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]) -> TensorDictBase:
-    """Batches [B] and random numbers of several learners, as :class:`SideBySide` reads them."""
-    given = {f"{i}": torch.stack(each) for i, each in enumerate(zip(*draws, strict=True))}
-    size = [len(batches)]
-    return TensorDict({"batch": torch.stack(list(batches)), "draws": TensorDict(given, size)}, size)
+def stacked(
+    batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Sequence[Tensor]]]
+) -> TensorDictBase:
+    """What :meth:`SideBySide.gradients` takes for one update after the other, [k, seeds].
+
+    Args:
+        batches (sequence of TensorDictBase): those [k, B] of each learner.
+        draws (sequence): the random numbers of each, in the order in which an update draws them,
+            for each of the k updates.
+    """
+    size = [len(draws[0]), len(draws)]
+    in_turn = [own for turn in zip(*draws, strict=True) for own in turn]
+    numbers = [torch.stack(each).unflatten(0, size) for each in zip(*in_turn, strict=True)]
+    given = {f"{i}": each for i, each in enumerate(numbers)}
+    batch = torch.stack(list(batches), 1)
+    return TensorDict({"batch": batch, "draws": TensorDict(given, size)}, size)
