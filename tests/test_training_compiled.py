@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch._inductor.utils import fresh_cache
+from torch.utils._pytree import tree_flatten
 
 from tests.configs import ROOT, tiny
 from tests.runs import numbers
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.training import resumed_config
 
 NOWHERE = {"cpp.cxx": (None, "/nowhere/g++")}
@@ -86,7 +88,7 @@ def test_a_run_that_goes_on_and_cannot_compile_has_the_numbers_of_an_uncompiled_
 COMPILE = """
 import warnings, torch
 from concurrent.futures import ThreadPoolExecutor
-from torchrl_etl.learners.compiled import compiled
+from torchrl_etl.learners.compiled import compiled, cuda_graph
 warnings.simplefilter("error", RuntimeWarning)
 print(torch.__file__)
 x = torch.ones(3, requires_grad=True)
@@ -114,3 +116,9 @@ def test_a_library_and_a_cache_in_folders_with_spaces_compile(tmp_path):
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
     assert str(spaced) in ran.stdout and ran.stdout.count("tensor([2., 2., 2.])") == 2
+
+
+def test_tensordicts_stay_in_pytree_beside_a_cuda_graph():
+    cuda_graph(lambda batch: batch)
+    leaves, _ = tree_flatten(TensorDict({"a": torch.zeros(2)}, [2]))
+    assert [type(leaf) for leaf in leaves] == [torch.Tensor]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
-from torchrl_etl.training import Interrupted, resumed_config
+from torchrl_etl.training import Interrupted, resumed_config, run_folder
+from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
 
 ONLY_AT_THE_END = "checkpoint.every=100000"
@@ -222,3 +224,14 @@ def test_a_simulation_that_diverges_at_every_resume_goes_on_with_another_restart
     assert resume(run, "restart_seed=1")["learn"]["frames"] == 608
     assert numbers(run)["csv/scalars/learn/updates.csv"].startswith(up_to_320)
     assert numbers(run) != numbers(tmp_path / "whole")
+
+
+def test_a_checkout_that_nobody_installed_has_facts_too(monkeypatch):
+    def missing(name: str) -> str:
+        if name == "torchrl_etl":
+            raise PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(run_folder, "version", missing)
+    found = facts()
+    assert "torchrl_etl" not in found and found["torch"] == version("torch")

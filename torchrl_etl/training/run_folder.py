@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RunFolder", "facts"]
 
-_PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "myosuite", "dm-control")
+_PACKAGES = (
+    *("torchrl_etl", "torch", "torchrl", "tensordict"),
+    *("gymnasium", "mujoco", "myosuite", "dm-control"),
+)
 
 
 class RunFolder:
@@ -224,9 +227,8 @@ class _ResumableTensorboard(TensorboardLogger):
 
 def facts() -> dict[str, Any]:
     """Versions, commit and machine class: what a number must carry to be believed."""
-    found = {"torchrl_etl": version("torchrl_etl"), "commit": _commit()}
-    found["python"] = platform.python_version()
-    for name in _PACKAGES:
+    found = {"commit": _commit(), "python": platform.python_version()}
+    for name in _PACKAGES:  # the first too, in a checkout that nobody installed
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
