@@ -37,6 +37,11 @@ def one_after_another(group: SideBySide, batches, draws) -> list:
     ]
 
 
+def scalars(run: Path, name: str) -> list[float]:
+    lines = (run / "csv" / "scalars" / f"{name}.csv").read_text().splitlines()
+    return [float(line.split(",")[1]) for line in lines]
+
+
 def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
     monkeypatch.setattr(SideBySide, "updates", one_after_another)
     summaries = together([work(tmp_path / f"{seed}", seed) for seed in (0, 1)])
@@ -52,6 +57,9 @@ def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
     for run in (tmp_path / "0", tmp_path / "1"):
         stage = Experiment(resumed_config(run), resume=run).learned()
         assert all(value.isfinite().all() for value in stage.learner.policy.parameters())
+    alone(work(tmp_path / "alone", 0, "method=sac"))
+    losses = [scalars(tmp_path / name, "learn/loss_qvalue") for name in ("0", "alone")]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
 
 
 def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
