@@ -311,6 +311,16 @@ def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     assert stage.learner.objective.sac.target_entropy == -len(set(groups))
 
 
+def test_shuffled_groups_are_dynsyn_s_dealt_to_other_muscles(tmp_path):
+    kind = "method.kind=studies.shuffled_groups:ShuffledGroups"
+    found, dealt = (
+        Experiment(rival("dynsyn", tmp_path / name, *more)).method
+        for name, more in (("found", ()), ("dealt", (kind,)))
+    )
+    groups = [method.found_groups(StopOnSignal()) for method in (found, dealt)]
+    assert sorted(groups[0]) == sorted(groups[1]) and groups[0] != groups[1]
+
+
 def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
     stage = Experiment(rival("dynsyn", tmp_path / "run")).method.stage()
     network = stage.learner.actor[0].module

@@ -59,17 +59,20 @@ class DynSyn(Method):
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         yield from super().prepare(stop)
         if not self.file.is_file():
-            seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
-            lengths = record_muscle_lengths(
-                self.context.make_env(action_repeat=1),  # a recorded step is a frame
-                self.charged,
-                amplitude=self.amplitude,
-                seed=2**30 + seed,
-                on_step=stop.check,
-            )
-            groups = group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed)
-            write_atomically(self.file, json.dumps(groups.tolist()))
+            write_atomically(self.file, json.dumps(self.found_groups(stop)))
         return {"groups": self.groups}
+
+    def found_groups(self, stop: StopOnSignal) -> list[int]:
+        """The group of each muscle, by its length while joints are thrown about."""
+        seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
+        lengths = record_muscle_lengths(
+            self.context.make_env(action_repeat=1),  # a recorded step is a frame
+            self.charged,
+            amplitude=self.amplitude,
+            seed=2**30 + seed,
+            on_step=stop.check,
+        )
+        return group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed).tolist()
 
     @property
     def file(self) -> Path:
