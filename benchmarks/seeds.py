@@ -71,7 +71,7 @@ def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, lis
             taken["together"].append(seconds() - middle)
 
     others = [training(stage, (repeats + 1) * block, at_once=AT_ONCE) for stage in stages[1:]]
-    for result in together([first(), *others], joint=True):
+    for result in together([first(), *others]):
         if isinstance(result, BaseException):
             raise result
     updates = block * len(stages)

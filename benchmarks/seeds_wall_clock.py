@@ -1,13 +1,10 @@
-"""Wall-clock seconds of two seeds: in one process, beside a process for each.
+"""Wall-clock seconds of two seeds on a CPU: one command, beside a command for each.
 
     python benchmarks/seeds_wall_clock.py
     python benchmarks/seeds_wall_clock.py --env myoLegWalk --frames 20000
 
-Whole commands of the recipe, from start to summary, on all cores; they take turns. ``processes``
-have a thread of PyTorch each, one process has as many as there are cores. ``ahead`` has the seeds'
-simulators in processes of their own, one batch ahead of the learners; the others step them in the
-process that learns. A ratio is to ``processes``, and on two cores 1 where a seed in company is
-no slower than alone.
+Whole commands of the recipe, from start to summary, on all cores; they take turns. Two commands
+have a thread of PyTorch each. A ratio is to them: 1 where company makes no seed slower.
 """
 
 from __future__ import annotations
@@ -24,7 +21,6 @@ from harness import interleave, line
 
 RECIPE = Path(__file__).resolve().parents[1] / "recipes" / "etl_sac.py"
 SEEDS = (0, 1)
-AHEAD = ["collector=process", "collector.num_envs=1"]
 
 
 def seconds(commands: list[list[str]]) -> float:
@@ -56,14 +52,14 @@ def main() -> None:
     together = [*run, f"seeds=[{','.join(map(str, SEEDS))}]"]
     alone = [[*run, "threads=1", f"seed={seed}"] for seed in SEEDS]
     cases = {
-        "processes": partial(seconds, alone),
-        "one_process": partial(seconds, [together]),
-        "one_process_ahead": partial(seconds, [[*together, *AHEAD]]),
+        "two_commands": partial(seconds, alone),
+        "one_command": partial(seconds, [together]),
     }
     values = interleave(cases, arguments.repeats)
     more = {"env": arguments.env, "frames": arguments.frames, "seeds": len(SEEDS)}
+    peers = {"two_commands": values["two_commands"]}
     for name, each in values.items():
-        line("seeds_wall_clock", name, "s", each, peers={"processes": values["processes"]}, **more)
+        line("seeds_wall_clock", name, "s", each, peers=peers, **more)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from torchrl_etl.command_line import (
 )
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.in_processes import in_processes
 from torchrl_etl.layout import choose_layout
 from torchrl_etl.training import Interrupted, resumed_config, together
 from torchrl_etl.training.config import of_each_seed
@@ -54,21 +56,26 @@ SYNERGIES = (
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with one_sentence(*OPENING_FAULTS, CollectionError):
-        experiments = list(asked_for(config, list(HydraConfig.get().overrides.task)))
-    with StopOnSignal() as stop:
-        ends = together([experiment.work(stop) for experiment in experiments])
-    for experiment, end in zip(experiments, ends, strict=True):
+        runs = list(asked_for(config, list(HydraConfig.get().overrides.task)))
+        apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
+        # Every one of them, before the first begins.
+        said = {"say": silently} if apart else {}
+        experiments = [Experiment(**{**run, **said}) for run in runs]
+    if apart:
+        del experiments
+        ends = in_processes(runs)
+    else:
+        with StopOnSignal() as stop:
+            found = together([experiment.work(stop) for experiment in experiments])
+        ends = [(each.folder.path, end) for each, end in zip(experiments, found, strict=True)]
+    for folder, end in ends:
         if isinstance(end, dict):
-            print(report(end, experiment.folder.path))
-    failures = [end for end in ends if isinstance(end, Exception)]
+            print(report(end, folder))
+    failures = [end for _, end in ends if isinstance(end, Exception)]
     for failure in failures:
         with suppress(SystemExit), one_sentence(OSError, SimulationError, CollectionError):
             raise failure
-    stopped = [
-        experiment.folder.path
-        for experiment, end in zip(experiments, ends, strict=True)
-        if isinstance(end, Interrupted)
-    ]
+    stopped = [folder for folder, end in ends if isinstance(end, Interrupted)]
     if stopped:
         folders = stopped[0] if len(stopped) == 1 else f"[{','.join(map(str, stopped))}]"
         command = shlex.join(["python", sys.argv[0], f"resume={folders}"])
@@ -78,20 +85,25 @@ def main(config: DictConfig) -> None:
         sys.exit(130 if stopped else 2)
 
 
-def asked_for(config: DictConfig, given: list[str]) -> Iterator[Experiment]:
-    """The runs that the configuration asks for, of which there are several with ``seeds``."""
+def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
+    """The runs that the configuration asks for, of which there are several with ``seeds``, as
+    arguments of ``Experiment``."""
     if config.resume is not None:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
         defaults = hydra.compose("config")
         for folder in map(Path, folders):
             stored = settled(resumed_config(folder, given, defaults=defaults))
-            yield Experiment(stored, resume=folder, say=print)
+            yield {"config": stored, "resume": folder, "say": print}
         return
     # Two runs that begin in the same second have the same name by default.
     named = any(override.lstrip("+").startswith("run_dir=") for override in given)
     for own in of_each_seed(settled(config)):
-        prefix = "" if config.seeds is None else f"seed {own.seed}: "
-        yield Experiment(own, unique=not named, say=lambda line, p=prefix: print(f"{p}{line}"))
+        say = print if config.seeds is None else partial(print, f"seed {own.seed}:")
+        yield {"config": own, "resume": None, "unique": not named, "say": say}
+
+
+def silently(line: str) -> None:
+    """Leave it to the process that does the run to say this."""
 
 
 def settled(config: DictConfig) -> DictConfig:

@@ -10,7 +10,7 @@ from torchrl.data import Bounded
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
-from torchrl_etl.learners import InThreads, SACLearner, SideBySide
+from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.learners.side_by_side import stacked
@@ -136,30 +136,6 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
     found, _ = compiled(group.gradients)(inputs)
     for one, other in zip(sum(expected, ()), sum(found, ()), strict=True):
         torch.testing.assert_close(other, one)
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_learners_in_threads_end_where_each_ends_that_draws_for_itself(name, traced_only):
-    ours, theirs = ([MAKERS[name](f"seed={seed}") for seed in SEEDS] for _ in range(2))
-    for stage in (*ours, *theirs):
-        fill(stage)
-        stage.close()
-    group = InThreads([stage.learner for stage in ours])
-    for stage in (*ours, *theirs):  # compiled, products may be rounded otherwise
-        stage.learner._gradients = compiled(stage.learner.gradients)
-    batches = [torch.stack([stage.sample() for _ in range(2)]) for stage in ours]
-    drawn, expected = [], []
-    for seed, one, other, earned in zip(SEEDS, ours, theirs, batches, strict=True):
-        other.learner.objective.load_state_dict(one.learner.objective.state_dict())
-        torch.manual_seed(seed)
-        drawn.append([one.learner.draw(batch) for batch in earned])
-        torch.manual_seed(seed)
-        expected.append(other.learner.updates(earned))
-    for found, alone in zip(group.updates(batches, drawn), expected, strict=True):
-        assert (found == alone).all()
-    for one, other in zip(ours, theirs, strict=True):
-        pairs = zip(one.learner.parameters, other.learner.parameters, strict=True)
-        assert all(torch.equal(found, expected) for found, expected in pairs)
 
 
 @pytest.mark.slow

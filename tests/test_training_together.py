@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
-import time
 from pathlib import Path
 
 import pytest
-from torchrl.envs.utils import exploration_type
 
 from tests.configs import tiny
 from tests.runs import numbers
+from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.learners import Objective, SACLearner, SideBySide, compiled
+from torchrl_etl.learners import SideBySide
 from torchrl_etl.training import Interrupted, alone, resumed_config, together
 from torchrl_etl.training.context import stage_seed
 from torchrl_etl.training.loop import StopOnSignal
@@ -31,10 +29,11 @@ def work(run: Path, seed: int, *settings: str, stop: StopOnSignal | None = None)
 
 def one_after_another(group: SideBySide, batches, draws) -> list:
     """The same updates with the same random numbers, each by itself: without rounding otherwise."""
-    return [
-        learner.updates(own, given)
-        for learner, own, given in zip(group.learners, batches, draws, strict=True)
-    ]
+    scalars = []
+    for learner, own, given in zip(group.learners, batches, draws, strict=True):
+        with given_draws(number for each in given for number in each):
+            scalars.append(learner.updates(own))
+    return scalars
 
 
 def scalars(run: Path, name: str) -> list[float]:
@@ -94,40 +93,3 @@ def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypat
     assert [type(end) for end in ends] == [Interrupted, Interrupted]
     goes_on = [Experiment(resumed_config(run), resume=run).work(StopOnSignal()) for run in runs]
     assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]
-
-
-def test_seeds_that_are_compiled_for_a_cpu_are_updated_in_threads(
-    tmp_path, monkeypatch, traced_only
-):
-    threads, updates = set(), SACLearner.updates
-
-    def told(learner, *arguments):
-        threads.add(threading.get_ident())
-        return updates(learner, *arguments)
-
-    monkeypatch.setattr(SACLearner, "updates", told)
-    together([work(tmp_path / f"{seed}", seed, "compile=true") for seed in (0, 1)])
-    assert len(threads - {threading.get_ident()}) == 4  # two a stage
-    for seed in (0, 1):
-        alone(work(tmp_path / f"alone{seed}", seed, "compile=true"))
-        assert numbers(tmp_path / f"{seed}") == numbers(tmp_path / f"alone{seed}")
-
-
-def test_seeds_that_cannot_be_compiled_take_turns_and_go_on_exploring(tmp_path, monkeypatch):
-    forward, inside, before = Objective.forward, [], exploration_type()
-
-    def watched(objective, batch):
-        inside.append(1)
-        assert len(inside) == 1
-        time.sleep(1e-3)
-        try:
-            return forward(objective, batch)
-        finally:
-            inside.pop()
-
-    monkeypatch.setattr(compiled, "_graph", lambda *arguments: 1 / 0)
-    monkeypatch.setattr(Objective, "forward", watched)
-    settings = ("method=sac", "compile=true")
-    with pytest.warns(RuntimeWarning, match="Updates run uncompiled"):
-        together([work(tmp_path / f"{seed}", seed, *settings) for seed in (0, 1)])
-    assert exploration_type() == before

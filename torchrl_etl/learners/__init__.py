@@ -2,7 +2,6 @@
 
 from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.ema import WarmedUpEMA
-from torchrl_etl.learners.in_threads import InThreads
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.sac import SACLearner, entropy_target, from_observation
 from torchrl_etl.learners.side_by_side import SideBySide
@@ -10,7 +9,6 @@ from torchrl_etl.learners.term import Term
 
 __all__ = [
     "NORMALIZED",
-    "InThreads",
     "Objective",
     "SACLearner",
     "SideBySide",

@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Callable, Iterator
 from functools import wraps
-from threading import Lock, current_thread, main_thread
 from typing import Any
 
 import torch
@@ -24,8 +23,6 @@ from torchrl_etl.learners.products import faster_products
 __all__ = ["compiled", "cuda_graph"]
 
 _ELSE = "compile=false leaves out the attempt"
-# The process has one tracer, one compiler and one exploration type, which TorchRL's losses set.
-_in_python = Lock()
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -43,8 +40,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
     the compiler does not know) costs a warning that says why; the function then runs uncompiled,
-    this call included. It must change nothing but what it returns. Compiled calls of several
-    threads run at the same time; others take turns.
+    this call included. It must change nothing but what it returns.
 
     Examples:
         >>> import torch
@@ -60,15 +56,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any) -> Any:
         nonlocal failed
         if failed:
-            with _in_python:
-                return function(*args)
+            return function(*args)
         leaves, spec = tree_flatten(args)
         kind = spec, [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
         try:
             graph = next((graph for known, graph in graphs if known == kind), None)
             if graph is None:
-                with _in_python:
-                    graph = _graph(function, spec, leaves)
+                graph = _graph(function, spec, leaves)
                 graphs.append((kind, graph))
             return graph(leaves)
         except Exception as error:
@@ -78,8 +72,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
                 RuntimeWarning,
                 stacklevel=2,
             )
-        with _in_python:
-            return function(*args)
+        return function(*args)
 
     return call
 
@@ -123,8 +116,7 @@ def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _options() -> dict[str, Any]:
-    """What makes inductor (torch 2.13) draw as PyTorch does, leave Python to other threads, and
-    compile where a path has a space.
+    """What makes inductor (torch 2.13) draw as PyTorch does, and compile where a path has a space.
 
     It hands the folder of PyTorch's libraries, its cache and its precompiled headers to a shell
     without quotes.
@@ -140,10 +132,6 @@ def _options() -> dict[str, Any]:
     if _is_split(TORCH_LIB_PATH):
         # The symbols that a kernel needs are those of the process, which has loaded PyTorch.
         options["aot_inductor.link_libtorch"] = False
-    elif current_thread() is not main_thread():
-        # Inductor's kernels keep Python's lock unless the calls between them are in C++ too, which
-        # needs the library, takes twice the time to compile and gives a thread by itself little.
-        options["cpp_wrapper"] = True
     return options
 
 

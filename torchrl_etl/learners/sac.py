@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from typing import Any, Literal
 
 import torch
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
-from torchrl_etl.draws import given_draws, redrawn
+from torchrl_etl.draws import redrawn
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -142,25 +141,19 @@ class SACLearner:
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
-    def update(self, batch: TensorDictBase, *draws: Sequence[Tensor]) -> TensorDictBase:
-        """Learn from a batch of transitions [B]; returns scalars to log.
-
-        Given ``learner.draw(batch)`` as well, it draws nothing, so that it may run in a
-        thread beside other learners; a CUDA graph draws for itself, and is left out then.
-        """
-        scalars = self.step(batch, *draws) if draws else self._step(batch)
+    def update(self, batch: TensorDictBase) -> TensorDictBase:
+        """Learn from a batch of transitions [B]; returns scalars to log."""
+        scalars = self._step(batch)
         self.ema.follow()  # counts in Python: no part of a CUDA graph
         return scalars
 
-    def updates(
-        self, batches: TensorDictBase, *draws: Sequence[Sequence[Tensor]]
-    ) -> TensorDictBase:
+    def updates(self, batches: TensorDictBase) -> TensorDictBase:
         """Learn from batches [k, B], one after the other; returns scalars to log [k]."""
-        return torch.stack([self.update(*turn) for turn in zip(batches, *draws, strict=True)])
+        return torch.stack([self.update(batch) for batch in batches])
 
-    def step(self, batch: TensorDictBase, *draws: Sequence[Tensor]) -> TensorDictBase:
+    def step(self, batch: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
-        gradients, scalars = self._gradients(batch, *draws)
+        gradients, scalars = self._gradients(batch)
         self.descend(gradients)
         return scalars
 
@@ -171,12 +164,9 @@ class SACLearner:
         for target in self.targets:
             target.step()
 
-    def gradients(
-        self, batch: TensorDictBase, *draws: Sequence[Tensor]
-    ) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         """Gradients of the objective, in the order of ``parameters``, and scalars to log."""
-        with given_draws(*draws) if draws else nullcontext():
-            loss, scalars = self.objective(batch)
+        loss, scalars = self.objective(batch)
         return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
 
     def update_term(self, term: Term, batch: TensorDictBase) -> TensorDictBase:

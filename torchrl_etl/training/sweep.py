@@ -24,7 +24,7 @@ from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
 from torchrl_etl.training.run_folder import RunFolder
 
-__all__ = ["Run", "Sweep"]
+__all__ = ["Run", "Sweep", "end_with_parent"]
 
 SETTINGS = "settings.txt"
 KEY = ("task", "goal", "method", "seed")
@@ -128,7 +128,7 @@ class Run:
                 stderr=log,
                 env=dict(environ),
                 start_new_session=True,
-                preexec_fn=_end_with_parent,
+                preexec_fn=end_with_parent,
             )
 
     def rows(self, status: str) -> Iterator[dict[str, Any]]:
@@ -256,7 +256,7 @@ def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple("" if row[name] is None else str(row[name]) for name in KEY)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """Let the kernel stop this process when the queue is killed; it then saves and ends."""
     if sys.platform == "linux":
         set_parent_death_signal = 1

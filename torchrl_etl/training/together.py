@@ -1,4 +1,4 @@
-"""Several runs that differ in their seeds, in one process."""
+"""Several runs that differ in their seeds, in one process: what fills a GPU."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from typing import Any, Generic
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.learners import InThreads, SideBySide
+from torchrl_etl.learners import SideBySide
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.work import Due, Result, Work, alone
 
 __all__ = ["together"]
 
 
-def together(
-    works: Sequence[Work[Result]], *, joint: bool | None = None
-) -> list[Result | BaseException]:
+def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     """Do all works in turns, and updates that are due at the same time together.
 
     Each work finds the random generators as it left them, and its updates get the random numbers
@@ -29,10 +27,6 @@ def together(
         works (sequence of generator): runs or stages, as :func:`~torchrl_etl.training.work.alone`
             takes one.
 
-    Keyword Args:
-        joint (bool, optional): one pass through the networks of all, rather than a thread for
-            each. Default: unless updates are compiled for a CPU.
-
     Returns:
         list: what each work returned, or the exception that ended it.
     """
@@ -42,13 +36,13 @@ def together(
         except (Exception, Interrupted) as error:
             return [error]
     runs = [_Run(work) for work in works]
-    groups: dict[str, SideBySide | InThreads] = {}
+    groups: dict[str, SideBySide] = {}
     try:
         for run in runs:
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
             for alike in dict.fromkeys(run.alike for run in waiting):
-                _update([run for run in waiting if run.alike == alike], groups, joint)
+                _update([run for run in waiting if run.alike == alike], groups)
     finally:
         for run in runs:
             run.work.close()
@@ -84,9 +78,7 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, error
 
 
-def _update(
-    runs: Sequence[_Run], groups: dict[str, SideBySide | InThreads], joint: bool | None
-) -> None:
+def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
     """Update the learners of these runs, which are in the same stage."""
     learners = [run.due.learner for run in runs]
     if len(runs) == 1:
@@ -95,9 +87,7 @@ def _update(
         return runs[0].go_on(scalars)
     group = groups.get(stage := runs[0].due.stage)
     if group is None or group.learners != learners:
-        if joint is None:
-            joint = not learners[0].compile or learners[0].device.type != "cpu"
-        group = groups[stage] = (SideBySide if joint else InThreads)(learners)
+        group = groups[stage] = SideBySide(learners)
     draws = []
     for run in runs:
         with run:

@@ -1,0 +1,66 @@
+"""Seeds in processes of their own are the runs that each would have been by itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.configs import ROOT, TINY, tiny
+from tests.runs import numbers
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.in_processes import in_processes
+
+SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")
+
+
+def test_each_process_does_one_run_and_a_run_that_fails_leaves_the_others(tmp_path, capfd):
+    configs = [tiny(f"run_dir='{tmp_path}/{seed}'", f"seed={seed}", *SHORT) for seed in (0, 1)]
+    (tmp_path / "1").write_text("a file where the folder should be")
+    ends = in_processes([{"config": each, "resume": None, "say": print} for each in configs])
+    assert f"Run folder: {tmp_path}/0" in capfd.readouterr().out
+    (folder, summary), (_, fault) = ends
+    assert folder == tmp_path / "0" and summary["seed"] == 0
+    assert isinstance(fault, OSError) and str(tmp_path / "1") in str(fault)
+    Experiment(tiny(f"run_dir='{tmp_path}/alone'", "seed=0", *SHORT)).run()
+    assert numbers(folder) == numbers(tmp_path / "alone")
+
+
+def children(process: int) -> list[int]:
+    command = ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(process)]
+    listed = subprocess.run(command, capture_output=True, text=True).stdout
+    return [int(line.split()[0]) for line in listed.splitlines() if "spawn_main" in line]
+
+
+def test_a_process_that_is_killed_and_a_signal_to_stop_are_told_in_a_line_each(tmp_path):
+    arguments = [*TINY, "method=sac", "frames=100000", "seeds=[0,1]", f"run_dir='{tmp_path}/run'"]
+    running = subprocess.Popen(
+        [sys.executable, str(ROOT / "recipes" / "etl_sac.py"), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    folders = [tmp_path / "run" / f"seed{seed}" for seed in (0, 1)]
+    deadline = time.monotonic() + 200
+    while not all(map(has_saved, folders)):
+        assert running.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    killed, _ = children(running.pid)
+    os.kill(killed, signal.SIGKILL)
+    running.send_signal(signal.SIGINT)
+    output, _ = running.communicate(timeout=100)
+    assert running.returncode == 130
+    assert f"The process of {folders[0]} ended with -9; go on with resume={folders[0]}." in output
+    assert f"Stopped and saved. To go on: python {ROOT}/recipes/etl_sac.py resume={folders[1]}" in (
+        output
+    )
+    assert "Traceback" not in output
+
+
+def has_saved(folder: Path) -> bool:
+    return any(folder.glob("checkpoints/learn/*/seal.json"))

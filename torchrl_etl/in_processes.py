@@ -1,0 +1,91 @@
+"""Several runs at the same time, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import traceback
+from collections.abc import Mapping, Sequence
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_etl.command_line import quiet_torchrl
+from torchrl_etl.experiment import Experiment
+from torchrl_etl.layout import available_cores
+from torchrl_etl.training import Interrupted, alone
+from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.sweep import end_with_parent
+
+__all__ = ["in_processes"]
+
+Ended = tuple[Path, "dict[str, Any] | BaseException"]
+
+
+def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:
+    """Do all runs at once; one that fails, is stopped or is killed leaves the others to go on.
+
+    On a CPU that is the fastest way: of several runs in one process all that Python does takes
+    turns, simulators included. Cores are divided among them. A signal to stop is passed on, once.
+
+    Args:
+        runs (sequence of mapping): arguments of :class:`~torchrl_etl.experiment.Experiment`, all
+            of them, and such as can be pickled.
+
+    Returns:
+        list: the run folder of each, and what :meth:`~torchrl_etl.experiment.Experiment.run`
+        returned or the exception that ended it.
+    """
+    context, threads = get_context("spawn"), max(1, available_cores() // len(runs))
+    ends: list[Ended] = [(Path(), Interrupted())] * len(runs)
+    working = {}
+    with StopOnSignal() as stop:
+        # A Ctrl-C in the terminal is for this process to pass on.
+        on_interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for index, run in enumerate(runs):
+            receiver, sender = context.Pipe(duplex=False)
+            process = context.Process(target=_run, args=(sender, run, threads))
+            process.start()
+            sender.close()
+            working[receiver] = index, process
+        signal.signal(signal.SIGINT, on_interrupt)
+        told = False
+        while working:
+            for receiver in wait(list(working), timeout=0.5):
+                index, process = working.pop(receiver)
+                ends[index] = _end(receiver, runs[index], process)
+            if stop.requested and not told:
+                told = True
+                for _, process in working.values():
+                    process.terminate()
+    return ends
+
+
+def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
+    """What a process does."""
+    os.setsid()
+    end_with_parent()
+    quiet_torchrl()
+    torch.set_num_threads(threads)
+    experiment = Experiment(**run)
+    try:
+        with StopOnSignal() as stop:
+            end = alone(experiment.work(stop))
+    except (Exception, Interrupted) as error:
+        error.add_note(traceback.format_exc())
+        end = error
+    sender.send((experiment.folder.path, end))
+
+
+def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
+    try:
+        return receiver.recv()
+    except EOFError:  # it was killed
+        process.join()
+        folder = Path(run["resume"] or run["config"].run_dir)
+        return folder, ChildProcessError(
+            f"The process of {folder} ended with {process.exitcode}; go on with resume={folder}."
+        )
