@@ -40,17 +40,19 @@ def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:
         returned or the exception that ended it.
     """
     context, threads = get_context("spawn"), max(1, available_cores() // len(runs))
-    ends: list[Ended] = [(Path(), Interrupted())] * len(runs)
-    working = {}
+    working, ends = {}, {}
     with StopOnSignal() as stop:
-        # A Ctrl-C in the terminal is for this process to pass on.
+        # A Ctrl-C in the terminal is for this process to pass on, and what it passes on waits until
+        # a process can save.
         on_interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
         for index, run in enumerate(runs):
             receiver, sender = context.Pipe(duplex=False)
             process = context.Process(target=_run, args=(sender, run, threads))
             process.start()
             sender.close()
             working[receiver] = index, process
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
         signal.signal(signal.SIGINT, on_interrupt)
         told = False
         while working:
@@ -61,22 +63,23 @@ def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:
                 told = True
                 for _, process in working.values():
                     process.terminate()
-    return ends
+    return [ends[index] for index in range(len(runs))]
 
 
 def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
     """What a process does."""
     os.setsid()
-    end_with_parent()
     quiet_torchrl()
     torch.set_num_threads(threads)
-    experiment = Experiment(**run)
-    try:
-        with StopOnSignal() as stop:
+    with StopOnSignal() as stop:
+        end_with_parent()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+        experiment = Experiment(**run)
+        try:
             end = alone(experiment.work(stop))
-    except (Exception, Interrupted) as error:
-        error.add_note(traceback.format_exc())
-        end = error
+        except (Exception, Interrupted) as error:
+            error.add_note(traceback.format_exc())
+            end = error
     sender.send((experiment.folder.path, end))
 
 
