@@ -6,6 +6,7 @@ import os
 import signal
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -80,7 +81,8 @@ def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
         except (Exception, Interrupted) as error:
             error.add_note(traceback.format_exc())
             end = error
-    sender.send((experiment.folder.path, end))
+    with suppress(BrokenPipeError):  # whoever waited was killed
+        sender.send((experiment.folder.path, end))
 
 
 def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
