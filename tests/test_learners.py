@@ -46,6 +46,31 @@ def test_a_step_along_gradients_is_adams_step(unused):
     assert unused is None or (ours[unused] == parameters()[unused]).all()
 
 
+def test_a_gradient_and_a_loaded_moment_lie_as_the_parameter_does():
+    turned = torch.nn.Parameter(torch.arange(6.0).view(3, 2).t())
+    plain = torch.nn.Parameter(turned.detach().contiguous())
+    optimizers = [GradientAdam([weight], lr=0.1, fused=True) for weight in (turned, plain)]
+    for step, gradient in enumerate(torch.randn(6, 2, 3)):
+        if step == 3:  # a checkpoint, which keeps no strides
+            saved = [deepcopy(optimizer.state_dict()) for optimizer in optimizers]
+            for moment in ("exp_avg", "exp_avg_sq"):
+                saved[0]["state"][0][moment] = saved[0]["state"][0][moment].contiguous()
+            for optimizer, state in zip(optimizers, saved, strict=True):
+                optimizer.load_state_dict(state)
+        for optimizer in optimizers:
+            optimizer.step_along([gradient if step % 2 else gradient.t().contiguous().t()])
+    torch.testing.assert_close(turned, plain)
+
+
+def test_a_loaded_optimizer_keeps_what_a_cuda_graph_reads():
+    rate = torch.tensor(0.5)
+    optimizer = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=rate, capturable=True)
+    of_a_cpu = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.25, fused=True)
+    optimizer.load_state_dict(of_a_cpu.state_dict())
+    (group,) = optimizer.param_groups
+    assert group["lr"] is rate and rate == 0.25 and group["capturable"]
+
+
 def test_an_ema_past_its_warm_up_is_pytorchs_and_copies_buffers():
     model = torch.nn.BatchNorm1d(2)
     ours = WarmedUpEMA(model, decay=0.3)

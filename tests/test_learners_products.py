@@ -51,8 +51,10 @@ def test_a_compiled_graph_of_large_and_small_products_has_the_same_gradients(cap
 
     def gradients(features: Tensor) -> list[Tensor]:
         first, second, last = weights
-        # Some columns of a weight, as where the rest of them meets what a batch shares.
-        hidden = torch.nn.functional.linear(features, first[:, 3:36], last[0]).tanh()
+        # Some columns of a weight, as where the rest of them meets what a batch shares, and one of
+        # them as the bias.
+        hidden = torch.nn.functional.linear(features, first[:, 3:36], first[:, 0]).tanh()
+        hidden = hidden + last[0]
         value = torch.nn.functional.linear(hidden @ second, last)
         return list(torch.autograd.grad(value.square().mean(), weights))
 

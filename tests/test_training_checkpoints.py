@@ -48,12 +48,15 @@ def test_rows_order_and_next_position_survive(filled, tmp_path):
     assert torch.equal(source.storage[:]["next", "b"], twin.storage[:]["next", "b"])
 
 
-def test_a_larger_buffer_takes_the_rows_and_has_room_for_more(tmp_path):
+def test_a_buffer_of_another_size_takes_the_newest_rows_in_their_order(tmp_path):
     source = buffer(4)
-    source.extend(rows(0, 4))
-    twin = copied(source, 6, tmp_path / "saved")
-    twin.extend(rows(4, 6))
-    assert twin.storage[:]["a"].flatten().tolist() == [0, 1, 2, 3, 4, 5]
+    for start in range(6):  # over the brim: 4 and 5 lie before 2 and 3
+        source.extend(rows(start, start + 1))
+    larger = copied(source, 6, tmp_path / "larger")
+    larger.extend(rows(6, 9))
+    assert larger.storage[:]["a"].flatten().tolist() == [8, 3, 4, 5, 6, 7]
+    smaller = copied(source, 3, tmp_path / "smaller")
+    assert smaller.storage[:]["a"].flatten().tolist() == [3, 4, 5]
 
 
 def test_only_the_filled_part_is_written(tmp_path):

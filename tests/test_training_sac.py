@@ -12,7 +12,7 @@ from torchrl.data.postprocs import MultiStep
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.configs import RESIDUAL
-from tests.stages import changed, fill, learn_stage, method_stage, snapshot
+from tests.stages import changed, explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.training import alone
 
 
@@ -33,6 +33,35 @@ def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
     assert changed(stage.learner.behavior, before)
     assert stage.learner.behavior.out_keys[-1] == "action"
     stage.close()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: method_stage("sac", "learn.sac.tau=0.3"),
+        lambda: explorer("explore.sac.tau=0.3", "exploration.tau=0.3").stage,
+    ],
+)
+def test_an_update_moves_the_temperature_and_every_target(make):
+    stage = make()
+    fill(stage)
+    stage.close()
+    learner, batch = stage.learner, stage.sample()
+    log_alpha = learner.objective.sac.log_alpha
+    at = next(i for i, each in enumerate(learner.parameters) if each is log_alpha)
+    torch.manual_seed(0)
+    slope, temperature = learner.gradients(batch)[0][at], log_alpha.item()
+    followers = [target for target in learner.targets if any(target._pairs)]
+    assert len(followers) == 1 + len([t for t in learner.objective.terms if t.target is not None])
+    before = [[each.clone() for each in target._pairs[0]] for target in followers]
+    torch.manual_seed(0)
+    learner.update(batch)
+    assert (log_alpha - temperature).sign() == -slope.sign() != 0
+    for target, starts in zip(followers, before, strict=True):
+        targets, sources = target._pairs
+        pairs = list(zip(starts, sources, strict=True))
+        torch.testing.assert_close(targets, [start.lerp(source, 0.3) for start, source in pairs])
+        assert any(not torch.equal(now, start) for now, start in zip(targets, starts, strict=True))
 
 
 @pytest.mark.parametrize("layout", [(16,), (2, 8), (2, 2, 4)])

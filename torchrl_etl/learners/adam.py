@@ -33,7 +33,16 @@ class GradientAdam(Adam):
     _walked: list[tuple[dict[str, Any], list[int], list[list[Tensor]]]] | None = None
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the state of another one, perhaps of another device."""
+        own = [(group["lr"], group["capturable"]) for group in self.param_groups]
         super().load_state_dict(state_dict)
+        for group, (lr, capturable) in zip(self.param_groups, own, strict=True):
+            loaded = float(group["lr"])  # a CUDA graph reads a tensor, and that same tensor
+            group["lr"] = lr.fill_(loaded) if isinstance(lr, Tensor) else loaded
+            group["capturable"] = capturable
+        for parameter, state in self.state.items():
+            for moment in ("exp_avg", "exp_avg_sq"):
+                state[moment] = _laid_out(state[moment], parameter)
         self._walked = None
 
     @torch.no_grad()

@@ -65,7 +65,8 @@ def _mm(a: Tensor, b: Tensor) -> Tensor:
 
 def _addmm(bias: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor:
     if beta == alpha == 1 and bias.shape == b.shape[1:] and by_onednn(a, b):
-        return torch.ops.torchrl_etl.product(a, _dense(b), bias)
+        # oneDNN takes no notice of a bias's strides.
+        return torch.ops.torchrl_etl.product(a, _dense(b), bias.contiguous())
     return NotImplemented
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointAdapter
 from torchrl.data import ReplayBuffer
@@ -50,6 +51,10 @@ class BufferAdapter(CheckpointAdapter):
         position = json.loads((path / "position.json").read_text())
         component.empty()
         if position["rows"]:
-            component.extend(TensorDict.load_memmap(path / "rows"))
+            rows, cursor = TensorDict.load_memmap(path / "rows"), position["cursor"]
             if position["rows"] == component.storage.max_size:  # full: the oldest row goes next
-                component.writer._cursor = position["cursor"]
+                component.extend(rows)
+                component.writer._cursor = cursor % position["rows"]
+            else:  # of another size: the oldest first, and the newest if there is no room for all
+                rows = torch.cat([rows[cursor:], rows[:cursor]])
+                component.extend(rows[-component.storage.max_size :])
