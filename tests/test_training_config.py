@@ -337,6 +337,8 @@ def test_each_seed_has_the_folder_that_it_would_have_by_itself():
         (5, "runs/a-5", False),
     ]
     assert all(own.seeds is None for own in configs)
+    # A process of its own has no Hydra, whose resolvers the default has.
+    assert not any(OmegaConf.is_interpolation(own, "run_dir") for own in configs)
 
 
 def test_seeds_that_would_share_a_folder_have_one_each_below_it():

@@ -158,6 +158,7 @@ def of_each_seed(config: DictConfig) -> list[DictConfig]:
         own = config.copy()
         own.seeds, own.seed = None, seed
         own.progress = config.progress and seed == seeds[0]
+        own.run_dir = own.run_dir  # no ${now} any more, which is Hydra's and another one later
         configs.append(own)
     if len({own.run_dir for own in configs}) < len(configs):
         for own in configs:
