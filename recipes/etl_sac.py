@@ -58,11 +58,12 @@ def main(config: DictConfig) -> None:
     with one_sentence(*OPENING_FAULTS, CollectionError):
         runs = list(asked_for(config, list(HydraConfig.get().overrides.task)))
         apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
-        # Every one of them, before the first begins.
-        said = {"say": silently} if apart else {}
-        experiments = [Experiment(**{**run, **said}) for run in runs]
+        # Every one of them, before the first begins; with processes these say what there is to say.
+        experiments = [
+            Experiment(run["config"], resume=run["resume"]) if apart else Experiment(**run)
+            for run in runs
+        ]
     if apart:
-        del experiments
         ends = in_processes(runs)
     else:
         with StopOnSignal() as stop:
@@ -100,10 +101,6 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
     for own in of_each_seed(settled(config)):
         say = print if config.seeds is None else partial(print, f"seed {own.seed}:")
         yield {"config": own, "resume": None, "unique": not named, "say": say}
-
-
-def silently(line: str) -> None:
-    """Leave it to the process that does the run to say this."""
 
 
 def settled(config: DictConfig) -> DictConfig:

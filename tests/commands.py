@@ -28,6 +28,18 @@ def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProc
     )
 
 
+def begun(recipe: str, *overrides: str, cwd: Path) -> subprocess.Popen:
+    """The same process while it runs, whose output holds its errors too."""
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
 def command(recipe: str, *arguments: str) -> int:
     """Run ``recipes/RECIPE`` with arguments as its command line; returns its exit code."""
     return script(ROOT / "recipes" / recipe, *arguments)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
+from tests.commands import begun
 from tests.configs import ROOT, TINY, tiny
 from tests.runs import numbers
 from torchrl_etl.experiment import Experiment
@@ -37,14 +37,7 @@ def children(process: int) -> list[int]:
 
 def test_a_process_that_is_killed_and_a_signal_to_stop_are_told_in_a_line_each(tmp_path):
     arguments = [*TINY, "method=sac", "frames=100000", "seeds=[0,1]", f"run_dir='{tmp_path}/run'"]
-    running = subprocess.Popen(
-        [sys.executable, str(ROOT / "recipes" / "etl_sac.py"), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    running = begun("etl_sac.py", *arguments, cwd=tmp_path)
     folders = [tmp_path / "run" / f"seed{seed}" for seed in (0, 1)]
     deadline = time.monotonic() + 200
     while not all(map(has_saved, folders)):

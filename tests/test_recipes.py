@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.commands import command, process
+from tests.commands import begun, command, process
 from tests.configs import ROOT, TINY
 from torchrl_etl.command_line import print_intervals, quote_paths
 from torchrl_etl.synergies import load_bundle, save_bundle
@@ -257,14 +257,7 @@ def test_help_explains_the_settings(capsys):
 def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     arguments = [*TINY, "explore.frames=100000", f"run_dir='{folder}'"]
-    running = subprocess.Popen(
-        [sys.executable, str(ROOT / "recipes" / "etl_sac.py"), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    running = begun("etl_sac.py", *arguments, cwd=tmp_path)
     deadline = time.monotonic() + 120
     while not list(folder.glob("checkpoints/explore/*/seal.json")):
         assert running.poll() is None and time.monotonic() < deadline

@@ -88,7 +88,7 @@ def test_a_run_that_goes_on_and_cannot_compile_has_the_numbers_of_an_uncompiled_
 COMPILE = """
 import warnings, torch
 from concurrent.futures import ThreadPoolExecutor
-from torchrl_etl.learners.compiled import compiled, cuda_graph
+from torchrl_etl.learners.compiled import compiled
 warnings.simplefilter("error", RuntimeWarning)
 print(torch.__file__)
 x = torch.ones(3, requires_grad=True)

@@ -7,6 +7,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from tests.configs import tiny
 from tests.runs import numbers
@@ -17,6 +18,7 @@ from torchrl_etl.learners import SideBySide
 from torchrl_etl.training import Interrupted, alone, resumed_config, together
 from torchrl_etl.training.context import stage_seed
 from torchrl_etl.training.loop import StopOnSignal
+from torchrl_etl.training.run_folder import RunFolder
 from torchrl_etl.training.stage import Stage
 
 SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")
@@ -36,11 +38,6 @@ def one_after_another(group: SideBySide, batches, draws) -> list:
     return scalars
 
 
-def scalars(run: Path, name: str) -> list[float]:
-    lines = (run / "csv" / "scalars" / f"{name}.csv").read_text().splitlines()
-    return [float(line.split(",")[1]) for line in lines]
-
-
 def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
     monkeypatch.setattr(SideBySide, "updates", one_after_another)
     summaries = together([work(tmp_path / f"{seed}", seed) for seed in (0, 1)])
@@ -57,8 +54,9 @@ def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
         stage = Experiment(resumed_config(run), resume=run).learned()
         assert all(value.isfinite().all() for value in stage.learner.policy.parameters())
     alone(work(tmp_path / "alone", 0, "method=sac"))
-    losses = [scalars(tmp_path / name, "learn/loss_qvalue") for name in ("0", "alone")]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
+    folders = (RunFolder(tmp_path / name, OmegaConf.create()) for name in ("0", "alone"))
+    (frames, losses), (same, expected) = (each.series("learn/loss_qvalue") for each in folders)
+    assert frames == same and losses == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ from torchrl_etl.training.sweep import end_with_parent
 
 __all__ = ["in_processes"]
 
-Ended = tuple[Path, "dict[str, Any] | BaseException"]
+Ended = tuple[Path, dict[str, Any] | BaseException]
 
 
 def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:

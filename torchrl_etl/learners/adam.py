@@ -95,9 +95,9 @@ class GradientAdam(Adam):
                 self._walked.append((group, at, [own, *kept]))
 
 
-def _laid_out(gradient: Tensor, parameter: Tensor) -> Tensor:
-    """In memory as the parameter is: fused Adam (torch 2.13) takes no notice of strides on a CPU,
-    and refuses others on a GPU."""
-    if gradient.stride() == parameter.stride():
-        return gradient
-    return torch.empty_like(parameter).copy_(gradient)
+def _laid_out(tensor: Tensor, parameter: Tensor) -> Tensor:
+    """A gradient or a moment, in memory as its parameter is: fused Adam (torch 2.13) takes no
+    notice of strides on a CPU, and refuses others on a GPU."""
+    if tensor.stride() == parameter.stride():
+        return tensor
+    return torch.empty_like(parameter).copy_(tensor)

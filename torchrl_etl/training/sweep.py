@@ -257,7 +257,8 @@ def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def end_with_parent() -> None:
-    """Let the kernel stop this process when the queue is killed; it then saves and ends."""
+    """Let the kernel stop this process when the one that started it is killed; it then saves and
+    ends."""
     if sys.platform == "linux":
         set_parent_death_signal = 1
         ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)
