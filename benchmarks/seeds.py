@@ -6,7 +6,7 @@
 
 One thread and CPU time, or with ``--device cuda`` the time until the GPU is done; both take turns
 in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make their updates as
-in training, 16 earned at a time: sampling, each seed's random numbers and its own state of the
+in training, 64 earned at a time: sampling, each seed's random numbers and its own state of the
 generators are included. A ratio is to the same seeds one after another; times the number of seeds,
 it is to one of them alone.
 """
@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 import torch
 from harness import line, recipe, train, training
-from update import AT_ONCE, transitions
+from update import transitions
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
@@ -31,6 +31,8 @@ from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import Stage
 from torchrl_etl.training.together import together
 from torchrl_etl.training.work import Work
+
+AT_ONCE = 64  # a batch of frames with one update for each
 
 
 def filled(seed: int, name: str, *overrides: str) -> Stage:

@@ -100,7 +100,7 @@ def test_seeds_are_timed_as_training_updates_them_together(benchmarks, monkeypat
     monkeypatch.setattr(
         SideBySide,
         "updates",
-        lambda self, batches, draws: calls.append(len(batches[0])) or updates(self, batches, draws),
+        lambda self, inputs: calls.append(len(inputs[0])) or updates(self, inputs),
     )
     stages = [method_stage("sac", f"seed={seed}") for seed in (0, 1)]
     for stage in stages:

@@ -77,11 +77,11 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
         torch.manual_seed(0)
         batches.append(found.stage.sample())
     group = SideBySide([found.stage.learner for found in twins[0]])
-    draws = []
+    inputs = []
     for learner, batch in zip(group.learners, batches, strict=True):
         torch.manual_seed(1)
-        draws.append(learner.draw(batch))
-    together = group.update(batches, draws)
+        inputs.append(learner.inputs(batch.unsqueeze(0)))
+    together = [scalars[0] for scalars in group.updates(inputs)]
     for found, batch, scalars in zip(twins[1], batches, together, strict=True):
         torch.manual_seed(0)
         assert (found.stage.sample() == batch).all()

@@ -13,7 +13,6 @@ from torchrl_etl.baselines import make_dynsyn_actor, set_frames
 from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
-from torchrl_etl.learners.side_by_side import stacked
 from torchrl_etl.modules import make_critic
 
 SEEDS = (0, 1)
@@ -31,31 +30,29 @@ MAKERS = {
 }
 
 
-def in_one(group, batches):
-    """What the pass over all of them reads, for one update."""
-    given = [[each] for each in draws(group, batches)]
-    return stacked([batch.unsqueeze(0) for batch in batches], given)[0]
-
-
-def draws(group, batches):
-    """The random numbers of each learner, of a generator that was seeded with its seed."""
+def inputs(learners, batches):
+    """What one update of each learner reads, drawn by a generator that was seeded with its seed."""
     drawn = []
-    for seed, learner, batch in zip(SEEDS, group.learners, batches, strict=True):
+    for seed, learner, batch in zip(SEEDS, learners, batches, strict=True):
         torch.manual_seed(seed)
-        drawn.append(learner.draw(batch))
+        drawn.append(learner.inputs(batch.unsqueeze(0)))
     return drawn
 
 
-def assert_gradients_are_those_of_each(learners, batches):
-    alone = []
-    for seed, learner, batch in zip(SEEDS, learners, batches, strict=True):
-        torch.manual_seed(seed)
-        alone.append(learner.gradients(batch))
+def taken(learners):
+    """The learners side by side, their weights in one."""
     group = SideBySide(learners)
-    together, scalars = group.gradients(in_one(group, batches))
-    for (expected, logged), found, log in zip(alone, together, scalars.unbind(0), strict=True):
-        assert len(found) == len(expected)
-        for one, other in zip(expected, found, strict=True):
+    group._take()
+    return group
+
+
+def assert_gradients_are_those_of_each(learners, batches):
+    read = inputs(learners, batches)
+    alone = [learner.gradients(own[0]) for learner, own in zip(learners, read, strict=True)]
+    together, scalars = taken(learners).gradients(torch.cat(read))
+    for seed, ((expected, logged), log) in enumerate(zip(alone, scalars.unbind(0), strict=True)):
+        for one, stack in zip(expected, together, strict=True):
+            other = None if stack is None else stack[seed]
             assert (one is None or not one.any()) if other is None else True
             if one is not None and other is not None:
                 torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
@@ -104,10 +101,10 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
     group = SideBySide([stage.learner for stage in ours])
     for _ in range(3):
         batches = [stage.sample() for stage in ours]
-        group.update(batches, draws(group, batches))
-        for seed, stage, batch in zip(SEEDS, theirs, batches, strict=True):
-            torch.manual_seed(seed)
-            stage.learner.update(batch)
+        read = inputs(group.learners, batches)
+        group.updates(read)
+        for stage, own in zip(theirs, read, strict=True):
+            stage.learner.updates(own)
     for one, other, start in zip(ours, theirs, starts, strict=True):
         moved = apart = 0.0
         for key, value in other.learner.ema.state_dict().items():
@@ -126,15 +123,16 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
         fill(stage)
         stage.close()
     batches = [stage.sample() for stage in stages]
-    group = SideBySide([stage.learner for stage in stages])
-    inputs = in_one(group, batches)
+    learners = [stage.learner for stage in stages]
+    read = torch.cat(inputs(learners, batches))
     with torch.no_grad():  # each its own, also of what is no network
         stages[1].learner.objective.sac.log_alpha += 1
         if (normalizer := stages[1].learner.objective.normalizer) is not None:
             normalizer.mean += 1
-    expected, _ = group.gradients(inputs)
-    found, _ = compiled(group.gradients)(inputs)
-    for one, other in zip(sum(expected, ()), sum(found, ()), strict=True):
+    group = taken(learners)
+    expected, _ = group.gradients(read)
+    found, _ = compiled(group.gradients)(read)
+    for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other, one)
 
 
@@ -153,7 +151,7 @@ def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(
         outs = []
         for call in (gradients, learner.gradients):
             torch.manual_seed(0)
-            outs.append(call(batch)[0])
+            outs.append(call(learner.inputs(batch.unsqueeze(0))[0])[0])
         for found, expected in zip(*outs, strict=True):
             torch.testing.assert_close(found, expected)
 
@@ -163,10 +161,10 @@ def test_finding_out_what_is_drawn_draws_nothing():
     fill(stage)
     batch, learner = stage.sample(), stage.learner
     torch.manual_seed(0)
-    first = learner.draw(batch)
+    first = learner.inputs(batch.unsqueeze(0))
     torch.manual_seed(0)
-    second = learner.draw(batch)
-    assert first and all(torch.equal(one, two) for one, two in zip(first, second, strict=True))
+    second = learner.inputs(batch.unsqueeze(0))
+    assert len(first["draws"].keys()) and (first == second).all()
     stage.close()
 
 

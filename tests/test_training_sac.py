@@ -49,16 +49,15 @@ def test_an_update_moves_the_temperature_and_every_target(make):
     learner, batch = stage.learner, stage.sample()
     log_alpha = learner.objective.sac.log_alpha
     at = next(i for i, each in enumerate(learner.parameters) if each is log_alpha)
-    torch.manual_seed(0)
-    slope, temperature = learner.gradients(batch)[0][at], log_alpha.item()
-    followers = [target for target in learner.targets if any(target._pairs)]
+    inputs = learner.inputs(batch.unsqueeze(0))
+    slope, temperature = learner.gradients(inputs[0])[0][at], log_alpha.item()
+    followers = [target for target in learner.targets if target.followers]
     assert len(followers) == 1 + len([t for t in learner.objective.terms if t.target is not None])
-    before = [[each.clone() for each in target._pairs[0]] for target in followers]
-    torch.manual_seed(0)
-    learner.update(batch)
+    before = [[each.clone() for each in target.followers] for target in followers]
+    learner.updates(inputs)
     assert (log_alpha - temperature).sign() == -slope.sign() != 0
     for target, starts in zip(followers, before, strict=True):
-        targets, sources = target._pairs
+        targets, sources = target.followers, target.followed
         pairs = list(zip(starts, sources, strict=True))
         torch.testing.assert_close(targets, [start.lerp(source, 0.3) for start, source in pairs])
         assert any(not torch.equal(now, start) for now, start in zip(targets, starts, strict=True))

@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 
 from tests.configs import tiny
 from tests.runs import numbers
-from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SideBySide
@@ -29,13 +28,9 @@ def work(run: Path, seed: int, *settings: str, stop: StopOnSignal | None = None)
     return Experiment(config).work(stop or StopOnSignal())
 
 
-def one_after_another(group: SideBySide, batches, draws) -> list:
-    """The same updates with the same random numbers, each by itself: without rounding otherwise."""
-    scalars = []
-    for learner, own, given in zip(group.learners, batches, draws, strict=True):
-        with given_draws(number for each in given for number in each):
-            scalars.append(learner.updates(own))
-    return scalars
+def one_after_another(group: SideBySide, inputs) -> list:
+    """The same updates, each by itself: without rounding otherwise."""
+    return [each.updates(own) for each, own in zip(group.learners, inputs, strict=True)]
 
 
 def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
 """Random numbers of losses, which can be drawn beforehand.
 
-A loss takes its random numbers from here, so that several learners that are updated as one can each
-be given the numbers that its own generator would have drawn for it alone.
+A loss takes its random numbers from here, so that those of many updates are drawn in one go, and
+several learners that are updated as one are each given what its own generator draws.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ __all__ = [
     "uniform_order",
 ]
 
-Draw = Callable[[], Tensor]
+Draw = Callable[..., Tensor]
+"""Draws one of a kind, or with sizes as arguments an array of so many."""
 
 
 class _Source(local):
@@ -40,17 +41,17 @@ _source = _Source()
 
 def standard_normal(like: Tensor) -> Tensor:
     """Independent N(0, 1) numbers of the shape of ``like``."""
-    return _next(partial(torch.randn, like.shape, dtype=like.dtype, device=like.device))
+    return _next(partial(_of_shape, torch.randn, like))
 
 
 def standard_uniform(like: Tensor) -> Tensor:
     """Independent U(0, 1) numbers of the shape of ``like``."""
-    return _next(partial(torch.rand, like.shape, dtype=like.dtype, device=like.device))
+    return _next(partial(_of_shape, torch.rand, like))
 
 
 def uniform_order(count: int, device: torch.device) -> Tensor:
     """A permutation of ``range(count)``, each as likely as any other."""
-    return _next(partial(torch.randperm, count, device=device))
+    return _next(lambda *sizes: torch.rand(*sizes, count, device=device).argsort(-1))
 
 
 @contextmanager
@@ -79,8 +80,8 @@ def recorded_draws() -> Iterator[list[Draw]]:
     Examples:
         >>> with recorded_draws() as draws:
         ...     _ = standard_normal(torch.zeros(2, 3))
-        >>> [draw().shape for draw in draws]
-        [torch.Size([2, 3])]
+        >>> [draw(16).shape for draw in draws]
+        [torch.Size([16, 2, 3])]
     """
     _source.recorded = []
     try:
@@ -90,27 +91,31 @@ def recorded_draws() -> Iterator[list[Draw]]:
 
 
 def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
-    """Draws, when called as ``function`` is, what that would draw, from the generators as they are.
+    """Draws what ``function`` would in so many calls, from the generators as they are.
 
-    What is drawn is found out by the first call, which runs ``function``; it must be the same for
-    all arguments.
+    What that is, which must be the same at all calls, is found out by the first, which runs
+    ``function``.
 
     Examples:
         >>> draw = redrawn(lambda x: x + standard_normal(x))
-        >>> [numbers.shape for numbers in draw(torch.zeros(2, 3))]
-        [torch.Size([2, 3])]
+        >>> [numbers.shape for numbers in draw(16, torch.zeros(2, 3))]
+        [torch.Size([16, 2, 3])]
     """
     known: list[Draw] | None = None
 
-    def draws(*args: Any) -> list[Tensor]:
+    def draws(calls: int, *args: Any) -> list[Tensor]:
         nonlocal known
         if known is None:
             with torch.random.fork_rng(), recorded_draws() as found, torch.no_grad():
                 function(*args)
             known = found
-        return [draw() for draw in known]
+        return [draw(calls) for draw in known]
 
     return draws
+
+
+def _of_shape(draw: Draw, like: Tensor, *sizes: int) -> Tensor:
+    return draw(*sizes, *like.shape, dtype=like.dtype, device=like.device)
 
 
 def _next(draw: Draw) -> Tensor:

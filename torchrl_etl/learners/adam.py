@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -32,6 +32,27 @@ class GradientAdam(Adam):
 
     _walked: list[tuple[dict[str, Any], list[int], list[list[Tensor]]]] | None = None
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._begin()
+
+    @property
+    def moments(self) -> list[Tensor]:
+        """Both moments of each parameter that has any, in their order."""
+        return [state[key] for state in self._states for key in ("exp_avg", "exp_avg_sq")]
+
+    @property
+    def steps(self) -> list[Tensor]:
+        """The number of steps that each of these parameters has had."""
+        return [state["step"] for state in self._states]
+
+    def over(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
+        """The same for other parameters than these, before its first step."""
+        groups = [
+            {**each, "params": list(map(other, each["params"]))} for each in self.param_groups
+        ]
+        return GradientAdam(groups)
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the state of another one, perhaps of another device."""
         own = [(group["lr"], group["capturable"]) for group in self.param_groups]
@@ -44,6 +65,7 @@ class GradientAdam(Adam):
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = _laid_out(state[moment], parameter)
         self._walked = None
+        self._begin()
 
     @torch.no_grad()
     def step_along(self, gradients: Sequence[Tensor | None]) -> None:
@@ -52,9 +74,7 @@ class GradientAdam(Adam):
         Which of them are ``None`` must not change.
         """
         if self._walked is None:
-            self.step_once(gradients)  # makes the state to walk over
             self._walk(gradients)
-            return
         for group, at, (parameters, *moments, steps) in self._walked:
             beta1, beta2 = group["betas"]
             own = [gradients[i] for i in at]
@@ -81,6 +101,18 @@ class GradientAdam(Adam):
     @property
     def _parameters(self) -> list[Tensor]:
         return [parameter for group in self.param_groups for parameter in group["params"]]
+
+    @property
+    def _states(self) -> list[dict[str, Tensor]]:
+        return [self.state[parameter] for parameter in self._parameters]
+
+    def _begin(self) -> None:
+        """As Adam begins where a parameter has its first gradient."""
+        for parameter in self._parameters:
+            if parameter not in self.state:
+                step = torch.zeros((), device=parameter.device)
+                moments = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
+                self.state[parameter] = {"step": step, **moments}
 
     def _walk(self, gradients: Sequence[Tensor | None]) -> None:
         parameters, index = self._parameters, 0

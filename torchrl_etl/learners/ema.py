@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import copy
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 __all__ = ["WarmedUpEMA"]
@@ -50,3 +53,16 @@ class WarmedUpEMA(AveragedModel):
         if self._buffers_of[0]:
             torch._foreach_copy_(*self._buffers_of)
         self.n_averaged += 1
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """What :meth:`follow` reads and changes, without the number of updates."""
+        both = *self._parameters_of, *self._buffers_of
+        return [tensor for each in both for tensor in each]
+
+    def over(self, other: Callable[[Tensor], Tensor]) -> WarmedUpEMA:
+        """The same for other tensors than these; they share their number of updates."""
+        twin = copy(self)
+        twin._parameters_of = tuple(list(map(other, each)) for each in self._parameters_of)
+        twin._buffers_of = tuple(list(map(other, each)) for each in self._buffers_of)
+        return twin

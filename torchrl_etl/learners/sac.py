@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
-from torchrl_etl.draws import redrawn
+from torchrl_etl.draws import given_draws, redrawn
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -137,23 +138,33 @@ class SACLearner:
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
-        self.draw = redrawn(self.objective)
+        self._draw = redrawn(self.objective)
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Learn from a batch of transitions [B]; returns scalars to log."""
-        scalars = self._step(batch)
-        self.ema.follow()  # counts in Python: no part of a CUDA graph
-        return scalars
+        return self.updates(self.inputs(batch.unsqueeze(0)))[0]
 
-    def updates(self, batches: TensorDictBase) -> TensorDictBase:
-        """Learn from batches [k, B], one after the other; returns scalars to log [k]."""
-        return torch.stack([self.update(batch) for batch in batches])
+    def updates(self, inputs: TensorDictBase) -> TensorDictBase:
+        """Learn from :meth:`inputs` [k], one after the other; returns scalars to log [k]."""
+        scalars = []
+        for each in inputs.unbind(0):
+            scalars.append(self._step(each))
+            self.ema.follow()  # counts in Python: no part of a CUDA graph
+        return torch.stack(scalars)
 
-    def step(self, batch: TensorDictBase) -> TensorDictBase:
+    def inputs(self, batches: TensorDictBase) -> TensorDictBase:
+        """What updates read [k]: under ``batch`` these batches [k, B], and under ``draws`` the
+        random numbers of each, in the order in which the objective takes them."""
+        count = [len(batches)]
+        draws = dict(enumerate(self._draw(*count, batches[0])))
+        draws = TensorDict({f"{i}": numbers for i, numbers in draws.items()}, count)
+        return TensorDict({"batch": batches, "draws": draws}, count)
+
+    def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
-        gradients, scalars = self._gradients(batch)
+        gradients, scalars = self._gradients(inputs)
         self.descend(gradients)
         return scalars
 
@@ -164,10 +175,16 @@ class SACLearner:
         for target in self.targets:
             target.step()
 
-    def gradients(self, batch: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+    def gradients(self, inputs: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         """Gradients of the objective, in the order of ``parameters``, and scalars to log."""
-        loss, scalars = self.objective(batch)
+        loss, scalars = self.loss(inputs)
         return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
+
+    def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """The objective, with these random numbers, and scalars to log."""
+        draws = inputs["draws"]
+        with given_draws(draws[f"{i}"] for i in range(len(draws.keys()))):
+            return self.objective(inputs["batch"])
 
     def update_term(self, term: Term, batch: TensorDictBase) -> TensorDictBase:
         """One gradient step on a single term, by the same optimizer; returns scalars to log."""
@@ -201,6 +218,23 @@ class SACLearner:
                 group["lr"] = factor * rate
         for tell in self.on_frames:
             tell(frames)
+
+    @property
+    def state(self) -> list[Tensor]:
+        """All that an update changes, each tensor once, except the numbers of updates."""
+        followers = [tensor for target in self.targets for tensor in target.followers]
+        found = *self.parameters, *followers, *self.ema.tensors, *self.optimizer.moments
+        return list({id(tensor): tensor for tensor in found}.values())
+
+    def over(self, other: Callable[[Tensor], Tensor]) -> SACLearner:
+        """Takes the same steps along gradients, with other parameters, targets and EMA."""
+        twin = copy(self)
+        twin.parameters = list(map(other, self.parameters))
+        twin.unit_rows = list(map(other, self.unit_rows))
+        twin.optimizer = self.optimizer.over(other)
+        twin.targets = [target.over(other) for target in self.targets]
+        twin.ema = self.ema.over(other)
+        return twin
 
     @property
     def parts(self) -> dict[str, Any]:

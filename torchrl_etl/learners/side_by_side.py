@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchrl_etl.draws import given_draws
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.sac import SACLearner
 
@@ -19,13 +17,14 @@ __all__ = ["SideBySide"]
 class SideBySide:
     """Updates learners of one make as each would be by itself, with one pass through the networks.
 
-    The objective is that of the first learner, under :func:`torch.vmap` over the stacked parameters
-    and buffers of all: there is no second set of equations. Optimizers, targets and EMAs stay those
-    of the learners; the pass is compiled if theirs are.
+    The objective is that of the first learner, under :func:`torch.vmap` over what all of them hold,
+    stacked, and its optimizer, targets and EMA take their steps on the stacks: there is no second
+    set of equations. What an update changes is taken from the learners before updates and given
+    back after them. The pass is compiled if theirs are.
 
     Args:
-        learners (sequence of SACLearner): of equal sizes, bounds and settings; weights, statistics
-            and whatever else their modules hold as buffers may differ.
+        learners (sequence of SACLearner): of equal sizes, bounds and settings, after equally many
+            updates; weights, statistics and whatever else their modules hold as buffers may differ.
 
     Raises:
         ValueError: if there is no learner, or one has parameters of other shapes.
@@ -40,16 +39,15 @@ class SideBySide:
         >>> def learner():
         ...     critic = make_critic({"observation": 3, "action": 2})
         ...     return SACLearner(make_actor({"observation": 3}, spec), critic, action_spec=spec)
-        >>> flag = torch.zeros(4, 1, dtype=torch.bool)
-        >>> ends = {"reward": torch.zeros(4, 1), "done": flag, "terminated": flag}
-        >>> entries = {"observation": torch.randn(4, 3), "action": torch.zeros(4, 2)}
-        >>> entries["next"] = {"observation": torch.randn(4, 3), **ends}
-        >>> batches = [TensorDict(entries, [4]) for _ in range(2)]
+        >>> flag = torch.zeros(5, 4, 1, dtype=torch.bool)
+        >>> ends = {"reward": torch.zeros(5, 4, 1), "done": flag, "terminated": flag}
+        >>> entries = {"observation": torch.randn(5, 4, 3), "action": torch.zeros(5, 4, 2)}
+        >>> entries["next"] = {"observation": torch.randn(5, 4, 3), **ends}
+        >>> batches = TensorDict(entries, [5, 4])  # for five updates
         >>> group = SideBySide([learner(), learner()])
-        >>> draws = [each.draw(batch) for each, batch in zip(group.learners, batches)]
-        >>> logs = group.update(batches, draws)
+        >>> logs = group.updates([each.inputs(batches) for each in group.learners])
         >>> [log["loss_qvalue"].shape for log in logs]
-        [torch.Size([]), torch.Size([])]
+        [torch.Size([5]), torch.Size([5])]
     """
 
     def __init__(self, learners: Sequence[SACLearner]) -> None:
@@ -63,84 +61,84 @@ class SideBySide:
             )
         self.learners = list(learners)
         first = learners[0]
+        self._stacks: dict[int, Tensor] = {}
+        self._all = first.over(self._stack)
         self._gradients = compiled(self.gradients) if first.compile else self.gradients
         graphed = first.compile and first.device.type == "cuda"
         self._step = cuda_graph(self.step) if graphed else self.step
 
-    def update(
-        self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Tensor]]
-    ) -> list[TensorDictBase]:
-        """One update of every learner, each on its own batch [B] and with its own random numbers.
-
-        Returns:
-            list of TensorDictBase: the scalars of each.
-        """
-        one = self.updates([batch.unsqueeze(0) for batch in batches], [[each] for each in draws])
-        return [scalars[0] for scalars in one]
-
-    def updates(
-        self, batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Sequence[Tensor]]]
-    ) -> list[TensorDictBase]:
-        """Updates of every learner on its batches [k, B], as many for each, one after the other.
+    def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+        """Every learner learns from its own :meth:`SACLearner.inputs` [k], one after the other.
 
         Returns:
             list of TensorDictBase: the scalars [k] of each.
         """
         scalars = []
-        for inputs in stacked(batches, draws):
-            scalars.append(self._step(inputs))
-            for learner in self.learners:
-                learner.ema.follow()
+        self._take()
+        for each in torch.stack(list(inputs), 1).unbind(0):
+            scalars.append(self._step(each))
+            self._all.ema.follow()
+        self._give_back()
         return list(torch.stack(scalars).unbind(1))
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Everything of an update that runs on the device; returns scalars [seeds]."""
         gradients, scalars = self._gradients(inputs)
-        for learner, own in zip(self.learners, gradients, strict=True):
-            learner.descend(own)
+        self._all.descend(gradients)
         return scalars
 
-    def gradients(
-        self, inputs: TensorDictBase
-    ) -> tuple[list[tuple[Tensor | None, ...]], TensorDictBase]:
-        """Each learner's gradients in the order of its ``parameters``, and scalars [seeds].
+    def gradients(self, inputs: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
+        """Gradients [seeds, ...] in the order of a learner's ``parameters``, and scalars [seeds].
 
         Args:
-            inputs (TensorDictBase): of shape [seeds]: ``batch`` [seeds, B], and under ``draws`` the
-                random numbers in the order in which they are drawn.
+            inputs (TensorDictBase): :meth:`SACLearner.inputs` of all, stacked: [seeds].
         """
-        objectives = [learner.objective for learner in self.learners]
-        # Stacked anew each time: gradients then flow back to the learners' own parameters.
-        params = torch.stack([TensorDict.from_module(each) for each in objectives])
-        first, draws = objectives[0], inputs["draws"]
-        order = [draws[f"{i}"] for i in range(len(draws.keys()))]
+        first = self.learners[0]
 
-        def objective(
-            params: TensorDictBase, batch: TensorDictBase, given: Any
-        ) -> tuple[Tensor, TensorDictBase]:
-            with params.to_module(first, preserve_module_state=False), given_draws(given):
-                return first(batch)
+        def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+            with held.to_module(first.objective, preserve_module_state=False):
+                return first.loss(own)
 
-        losses, scalars = torch.vmap(objective)(params, inputs["batch"], order)
-        parameters = [p for learner in self.learners for p in learner.parameters]
-        flat = torch.autograd.grad(losses.sum(), parameters, allow_unused=True)
-        count = len(self.learners[0].parameters)
-        return [flat[i : i + count] for i in range(0, len(flat), count)], scalars.detach()
+        losses, scalars = torch.vmap(loss)(self._held(), inputs)
+        gradients = torch.autograd.grad(losses.sum(), self._all.parameters, allow_unused=True)
+        return gradients, scalars.detach()
 
+    def _held(self) -> TensorDictBase:
+        """What the learners' objectives hold [seeds]: stacks, or what no update changes, stacked
+        anew."""
 
-def stacked(
-    batches: Sequence[TensorDictBase], draws: Sequence[Sequence[Sequence[Tensor]]]
-) -> TensorDictBase:
-    """What :meth:`SideBySide.gradients` takes for one update after the other, [k, seeds].
+        def stacked(*own: Tensor) -> Tensor:
+            found = self._stacks.get(id(own[0]))
+            return torch.stack(own) if found is None else found
 
-    Args:
-        batches (sequence of TensorDictBase): those [k, B] of each learner.
-        draws (sequence): the random numbers of each, in the order in which an update draws them,
-            for each of the k updates.
-    """
-    size = [len(draws[0]), len(draws)]
-    in_turn = [own for turn in zip(*draws, strict=True) for own in turn]
-    numbers = [torch.stack(each).unflatten(0, size) for each in zip(*in_turn, strict=True)]
-    given = {f"{i}": each for i, each in enumerate(numbers)}
-    batch = torch.stack(list(batches), 1)
-    return TensorDict({"batch": batch, "draws": TensorDict(given, size)}, size)
+        held, *others = (TensorDict.from_module(each.objective) for each in self.learners)
+        return held.apply(stacked, *others, batch_size=[len(self.learners)])
+
+    def _stack(self, own: Tensor) -> Tensor:
+        """Where a tensor of the first learner is updated, with those of the others."""
+        if id(own) not in self._stacks:
+            stack = own.new_empty(len(self.learners), *own.shape)
+            self._stacks[id(own)] = nn.Parameter(stack) if own.requires_grad else stack
+        return self._stacks[id(own)]
+
+    @torch.no_grad()
+    def _take(self) -> None:
+        first = self.learners[0].optimizer
+        torch._foreach_copy_(*self._rows_and_own())
+        torch._foreach_copy_(self._all.optimizer.steps, first.steps)
+        for group, own in zip(self._all.optimizer.param_groups, first.param_groups, strict=True):
+            group["lr"] = own["lr"]
+
+    @torch.no_grad()
+    def _give_back(self) -> None:
+        rows, own = self._rows_and_own()
+        torch._foreach_copy_(own, rows)
+        for learner in self.learners:
+            torch._foreach_copy_(learner.optimizer.steps, self._all.optimizer.steps)
+            learner.ema.n_averaged.copy_(self._all.ema.n_averaged)
+
+    def _rows_and_own(self) -> tuple[list[Tensor], list[Tensor]]:
+        """What the stacks hold, learner by learner, and what the learners do."""
+        rows = zip(*(stack.unbind(0) for stack in self._all.state), strict=True)
+        own = (learner.state for learner in self.learners)
+        return [row for each in rows for row in each], [tensor for each in own for tensor in each]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import copy
+
 import torch
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 __all__ = ["FusedSoftUpdate"]
@@ -31,9 +35,15 @@ class FusedSoftUpdate(SoftUpdate):
             (self._targets.get((f"target_{name}", *key)), source)
             for (name, *key), source in self._sources.items(True, True)
         )
-        self._pairs = tuple(map(list, zip(*pairs, strict=True)))
+        self.followers, self.followed = map(list, zip(*pairs, strict=True))
 
     @torch.no_grad()
     def step(self) -> None:
-        targets, sources = self._pairs
-        torch._foreach_lerp_(targets, sources, 1 - self.eps)
+        torch._foreach_lerp_(self.followers, self.followed, 1 - self.eps)
+
+    def over(self, other: Callable[[Tensor], Tensor]) -> FusedSoftUpdate:
+        """The same for other tensors than these."""
+        twin = copy(self)
+        twin.followers = list(map(other, self.followers))
+        twin.followed = list(map(other, self.followed))
+        return twin

@@ -37,8 +37,9 @@ TRANSITION = (
 )
 
 
-AT_ONCE = 16
-"""Batches that are read from the buffer in one go, where it does nothing more than read them."""
+AT_ONCE = {"cpu": 16, "cuda": 64}
+"""Batches that are read from the buffer in one go, where it does nothing more than read them; more
+of them cost a CPU its caches, fewer leave a GPU waiting."""
 
 
 class Progress:
@@ -143,7 +144,7 @@ class Stage:
         self.buffer = TensorDictReplayBuffer(storage=storage, transform=Compose(*transforms))
         self.transforms = nn.ModuleList(transforms)
         # What a transform makes of a batch may depend on the updates before it: a bonus does.
-        self._at_once = 1 if transforms else AT_ONCE
+        self._at_once = 1 if transforms else AT_ONCE[device.type]
         self._kept = [*TRANSITION, *keep]
         self.multi_step = None
         if n_steps > 1:
@@ -187,7 +188,7 @@ class Stage:
         for count in parts(due, self._at_once):
             batches = self.samples(count)
             if self._update is None:
-                logs.append((yield Due(self.name, self.learner, batches)))
+                logs.append((yield Due(self.name, self.learner, self.learner.inputs(batches))))
             else:
                 logs.append(torch.stack([self._update(batch) for batch in batches]))
         self.learner.advance(self.frames, self.frames / self.budget)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, Generic
 
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.work import Due, Result, Work, alone
 
@@ -18,8 +19,7 @@ __all__ = ["together"]
 def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     """Do all works in turns, and updates that are due at the same time together.
 
-    Each work finds the random generators as it left them, and its updates get the random numbers
-    that it would have drawn for them by itself: it ends with the numbers of
+    Each work finds the random generators as it left them: it ends with the numbers of
     :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
     the others to go on.
 
@@ -36,13 +36,16 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
         except (Exception, Interrupted) as error:
             return [error]
     runs = [_Run(work) for work in works]
-    groups: dict[str, SideBySide] = {}
+    groups: dict[tuple[SACLearner, ...], SideBySide] = {}
     try:
         for run in runs:
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
-            for alike in dict.fromkeys(run.alike for run in waiting):
-                _update([run for run in waiting if run.alike == alike], groups)
+            alike = defaultdict(list)
+            for run in waiting:
+                alike[run.alike].append(run)
+            for each in alike.values():
+                _update(each, groups)
     finally:
         for run in runs:
             run.work.close()
@@ -58,9 +61,10 @@ class _Run(Generic[Result]):
         self.result: Result | BaseException
 
     @property
-    def alike(self) -> tuple[str, int]:
-        """What is due to runs that can be updated together: the stage, and how many updates."""
-        return self.due.stage, len(self.due.batches)
+    def alike(self) -> tuple[str, int, int]:
+        """What is due to runs that can be updated together: the stage, how many updates, and after
+        how many."""
+        return self.due.stage, len(self.due.inputs), int(self.due.learner.ema.n_averaged)
 
     def __enter__(self) -> None:
         GlobalRNGState().load_state_dict(self.random)
@@ -78,20 +82,16 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, error
 
 
-def _update(runs: Sequence[_Run], groups: dict[str, SideBySide]) -> None:
+def _update(runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]) -> None:
     """Update the learners of these runs, which are in the same stage."""
-    learners = [run.due.learner for run in runs]
+    learners = tuple(run.due.learner for run in runs)
     if len(runs) == 1:
         with runs[0]:
-            scalars = learners[0].updates(runs[0].due.batches)
+            scalars = learners[0].updates(runs[0].due.inputs)
         return runs[0].go_on(scalars)
-    group = groups.get(stage := runs[0].due.stage)
-    if group is None or group.learners != learners:
-        group = groups[stage] = SideBySide(learners)
-    draws = []
-    for run in runs:
-        with run:
-            draws.append([run.due.learner.draw(batch) for batch in run.due.batches])
-    scalars = group.updates([run.due.batches for run in runs], draws)
+    group = groups.get(learners)
+    if group is None:
+        group = groups[learners] = SideBySide(learners)
+    scalars = group.updates([run.due.inputs for run in runs])
     for run, own in zip(runs, scalars, strict=True):
         run.go_on(own)

@@ -16,11 +16,11 @@ Result = TypeVar("Result")
 
 
 class Due(NamedTuple):
-    """Updates that a learner has earned, on these batches [k, B], in the stage of this name."""
+    """Updates that a learner has earned, on these inputs [k], in the stage of this name."""
 
     stage: str
     learner: SACLearner
-    batches: TensorDictBase
+    inputs: TensorDictBase
 
 
 # It yields what is due, is sent the scalars [k] of those updates, and returns what it is done for.
@@ -33,6 +33,6 @@ def alone(work: Work[Result]) -> Result:
         try:
             due = next(work)
             while True:
-                due = work.send(due.learner.updates(due.batches))
+                due = work.send(due.learner.updates(due.inputs))
         except StopIteration as end:
             return end.value
