@@ -1,11 +1,12 @@
 """Returns of training episodes, by stretches of frames: less noisy than a fixed start's evaluation.
 
     python studies/training_returns.py RUN [RUN ...] --out docs/results/kill_test/training.csv
+    python studies/training_returns.py RUN [RUN ...] --series loss_actor --out FILE.csv
 
 Where a task always starts alike, all evaluation episodes of a deterministic policy are the same
 one. Training acts with noise, in dozens of episodes between two evaluations: ``return`` is the mean
-of stage 2's log over the ``--stretch`` frames that end at ``frames``. Stretches that a run did not
-finish are left out. One CSV row a stretch; rows are appended.
+of stage 2's log over the ``--stretch`` frames that end at ``frames``; ``--series`` names another
+one of that log. Stretches that a run did not finish are left out. One CSV row a stretch; rows are appended.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--series", default="return", help="what of the log")
     parser.add_argument("--stretch", type=int, default=25000, help="frames of a row")
     parser.add_argument("--out", type=Path, required=True, help="CSV file to append to")
     arguments = parser.parse_args()
@@ -37,8 +39,9 @@ def main() -> None:
             parser.error(f"{run} does not say what it was made with; name a run that has begun.")
         start = starts[-1]
         row = {"task": config.env, "method": config.method.name, "seed": config.seed}
-        for frames, mean in stretches(*folder.series("learn/return"), arguments.stretch):
-            row |= {"frames": frames, "return": round(mean, 1)}
+        series = folder.series(f"learn/{arguments.series}")
+        for frames, mean in stretches(*series, arguments.stretch):
+            row |= {"frames": frames, arguments.series: round(mean, 1)}
             append(arguments.out, row | {key: start[key] for key in ("commit", "machine")})
 
 
