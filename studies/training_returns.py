@@ -6,7 +6,8 @@
 Where a task always starts alike, all evaluation episodes of a deterministic policy are the same
 one. Training acts with noise, in dozens of episodes between two evaluations: ``return`` is the mean
 of stage 2's log over the ``--stretch`` frames that end at ``frames``; ``--series`` names another
-one of that log. Stretches that a run did not finish are left out. One CSV row a stretch; rows are appended.
+one of that log. Stretches that a run did not finish are left out. One CSV row a stretch; rows are
+appended.
 """
 
 from __future__ import annotations
