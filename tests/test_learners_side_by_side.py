@@ -99,9 +99,8 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
         )
     starts = [snapshot(stage.learner.ema) for stage in theirs]
     group = SideBySide([stage.learner for stage in ours])
-    for _ in range(3):
-        batches = [stage.sample() for stage in ours]
-        read = inputs(group.learners, batches)
+    for _ in range(2):
+        read = [stage.learner.inputs(stage.samples(3)) for stage in ours]
         group.updates(read)
         for stage, own in zip(theirs, read, strict=True):
             stage.learner.updates(own)

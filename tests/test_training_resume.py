@@ -262,16 +262,16 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
 def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_path, monkeypatch):
     run = tmp_path / "run"
     experiment = Experiment(tiny(f"run_dir='{run}'", "learn.prefill=true"))
-    update, updates = SACLearner.update, []
+    learn, updates = SACLearner.updates, []
 
-    def update_and_signal(self, batch):
+    def learn_and_signal(self, inputs):
         if experiment.folder.explored.exists():  # in stage 2
-            updates.append(batch)
-            if len(updates) == 20:
+            if len(updates) < 20 <= len(updates) + len(inputs):
                 os.kill(os.getpid(), signal.SIGINT)
-        return update(self, batch)
+            updates.extend(inputs)
+        return learn(self, inputs)
 
-    monkeypatch.setattr(SACLearner, "update", update_and_signal)
+    monkeypatch.setattr(SACLearner, "updates", learn_and_signal)
     with pytest.raises(Interrupted):
         experiment.run()
     assert len(updates) < 600 // 16
