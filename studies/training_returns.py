@@ -6,8 +6,8 @@
 Where a task always starts alike, all evaluation episodes of a deterministic policy are the same
 one. Training acts with noise, in dozens of episodes between two evaluations: ``return`` is the mean
 of stage 2's log over the ``--stretch`` frames that end at ``frames``; ``--series`` names another
-one of that log. Stretches that a run did not finish are left out. One CSV row a stretch; rows are
-appended.
+one of that log. Stretches that a run did not finish, or log in, are left out. One CSV row a
+stretch; rows are appended.
 """
 
 from __future__ import annotations
@@ -47,10 +47,11 @@ def main() -> None:
 
 
 def stretches(frames: list[int], returns: list[float], length: int) -> list[tuple[int, float]]:
-    """The end of each whole stretch, and the mean of what was logged in it."""
+    """The end of each whole stretch, and the mean of what was logged in it, if anything was."""
     ends = range(length, frames[-1] + 1, length) if frames else ()
     pairs = list(zip(frames, returns, strict=True))
-    return [(end, fmean(r for f, r in pairs if end - length < f <= end)) for end in ends]
+    logged = [(end, [r for f, r in pairs if end - length < f <= end]) for end in ends]
+    return [(end, fmean(values)) for end, values in logged if values]
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ def test_a_stretch_is_the_mean_of_its_log_and_an_unfinished_one_is_left_out(tmp_
     run = tmp_path / "run"
     log = run / "csv" / "scalars" / "learn" / "return.csv"
     log.parent.mkdir(parents=True)
-    log.write_text("5,1.0\n10,3.0\n15,4.0\n20,6.0\n25,9.0\n")
+    log.write_text("5,1.0\n10,3.0\n15,4.0\n20,6.0\n45,9.0\n")
     (run / "config.yaml").write_text("env: task\nmethod: {name: sac}\nseed: 3\n")
     (run / "versions.json").write_text(json.dumps([{"commit": "c", "machine": "m"}]))
     out = tmp_path / "out.csv"
@@ -24,5 +24,5 @@ def test_a_stretch_is_the_mean_of_its_log_and_an_unfinished_one_is_left_out(tmp_
         rows = [list(row.values()) for row in csv.DictReader(file)]
     assert rows == [
         ["task", "sac", "3", "10", "2.0", "c", "m"],
-        ["task", "sac", "3", "20", "5.0", "c", "m"],
+        ["task", "sac", "3", "20", "5.0", "c", "m"],  # nothing in the next two
     ]
