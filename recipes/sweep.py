@@ -23,7 +23,7 @@ from omegaconf import DictConfig, ListConfig
 from rich.live import Live
 from rich.table import Table
 
-from torchrl_etl.checks import check_choice, check_integer
+from torchrl_etl.checks import check_choice, check_flag, check_integer
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
 from torchrl_etl.layout import available_cores
@@ -38,7 +38,8 @@ def main(config: DictConfig) -> None:
     with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
         runs = queue(config)
         jobs = config.jobs or available_cores()
-        sweep = Sweep(runs, Path(config.out), jobs=jobs, attempts=config.attempts)
+        options = {"attempts": config.attempts, "seeds_at_once": config.seeds_at_once}
+        sweep = Sweep(runs, Path(config.out), jobs=jobs, **options)
     display = Display(sweep)
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
@@ -52,9 +53,9 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
     failed = [run for run in runs if sweep.status(run) == "failed"]
     for run in failed:
-        lines = (run.path / "log.txt").read_text(encoding="utf-8").splitlines()
+        lines = run.log.read_text(encoding="utf-8").splitlines()
         last = next((line for line in reversed(lines) if line.strip()), "no message")
-        print(f"Failed: {run.name}, {last} (all of it in {run.path / 'log.txt'})", file=sys.stderr)
+        print(f"Failed: {run.name}, {last} (all of it in {run.log})", file=sys.stderr)
     print(f"Evaluations: {sweep.folder / 'results.csv'}")
     sys.exit(1 if failed else 0)
 
@@ -69,6 +70,7 @@ def queue(config: DictConfig) -> list[Run]:
     for method in config.methods:
         check_choice("methods", method, methods)
     check_integer(1, frames=config.frames, attempts=config.attempts)
+    check_flag(seeds_at_once=config.seeds_at_once)
     folder = Path(config.out).resolve()
     runs = []
     for seed, task, method in product(config.seeds, config.tasks, config.methods):

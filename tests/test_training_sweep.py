@@ -76,6 +76,31 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")} == before
 
 
+@pytest.mark.slow
+def test_seeds_in_one_process_that_were_killed_go_on_together(tmp_path):
+    out = tmp_path / "a sweep"
+    what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0,1]", "frames=900", "jobs=1"]
+    what += ["seeds_at_once=true", f"settings={' '.join(SMALL)}", f"out={out}"]
+    process = subprocess.Popen([*RECIPE, *what], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    runs = [out / f"overactuated-sac-seed{seed}" for seed in (0, 1)]
+    deadline = time.monotonic() + 120
+    while not all(list((run / "checkpoints" / "learn").glob("*/seal.json")) for run in runs):
+        assert process.poll() is None, process.stdout.read().decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+    ended = subprocess.run([*RECIPE, *what], capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    rows = results(out)
+    assert {(row["seed"], row["status"]) for row in rows} == {("0", "finished"), ("1", "finished")}
+    assert [row["return"] for row in rows if row["seed"] == "0"] != [
+        row["return"] for row in rows if row["seed"] == "1"
+    ]
+    assert (runs[0] / "log.txt").exists() and not (runs[1] / "log.txt").exists()
+
+
 def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
     run = small_run(tmp_path, "print('it broke'); raise SystemExit(3)")
     sweep = Sweep([run], tmp_path / "out", jobs=1, attempts=2)

@@ -50,6 +50,7 @@ class Run:
     command: Sequence[str] = field(repr=False)
     frames: int
     process: subprocess.Popen | None = field(default=None, repr=False)
+    leader: Run | None = field(default=None, repr=False)
     starts: int = 0
 
     @property
@@ -108,28 +109,10 @@ class Run:
 
         return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
-    def start(self, environ: Mapping[str, str]) -> None:
-        """Begin, or go on where an earlier start was stopped."""
-        self.starts += 1
-        script, *settings = self.command
-        self.path.mkdir(parents=True, exist_ok=True)
-        if self.has_begun:
-            where, settings = f"resume={self.path}", []
-        else:
-            where = f"run_dir={self.path}"
-            write_atomically(self.path / SETTINGS, "\n".join(settings))
-        command = [sys.executable, script, where, f"frames={self.frames}", *settings]
-        with (self.path / "log.txt").open("a", encoding="utf-8") as log:
-            # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=dict(environ),
-                start_new_session=True,
-                preexec_fn=end_with_parent,
-            )
+    @property
+    def log(self) -> Path:
+        """What its process prints: into the folder of the first of several seeds."""
+        return (self.leader or self).path / "log.txt"
 
     def rows(self, status: str) -> Iterator[dict[str, Any]]:
         """Its evaluations, oldest first."""
@@ -153,6 +136,41 @@ class Run:
             yield row
 
 
+def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
+    """Begin a run, or several that differ in their seeds, in one process; or go on where an earlier
+    start was stopped, if they have begun."""
+    first, *others = runs
+    script, *settings = first.command
+    if first.has_begun:
+        folders = ",".join(str(run.path) for run in runs)
+        where, settings = f"resume=[{folders}]" if others else f"resume={folders}", []
+    elif others:
+        where = f"run_dir={str(first.path).removesuffix(str(first.seed))}${{seed}}"
+        settings = [each for each in settings if not each.startswith("seed=")]
+        settings.append(f"seeds=[{','.join(str(run.seed) for run in runs)}]")
+    else:
+        where = f"run_dir={first.path}"
+    for run in runs:
+        run.starts, run.leader = run.starts + 1, first
+        run.path.mkdir(parents=True, exist_ok=True)
+        if not run.has_begun:
+            write_atomically(run.path / SETTINGS, "\n".join(run.command[1:]))
+    command = [sys.executable, script, where, f"frames={first.frames}", *settings]
+    with first.log.open("a", encoding="utf-8") as log:
+        # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=dict(environ),
+            start_new_session=True,
+            preexec_fn=end_with_parent,
+        )
+    for run in runs:
+        run.process = process
+
+
 class Sweep:
     """Runs a queue with several processes at a time and keeps one table of all evaluations.
 
@@ -168,16 +186,27 @@ class Sweep:
     Keyword Args:
         jobs (int): processes at a time.
         attempts (int): starts of one run, at most. Default: 3.
+        seeds_at_once (bool): all seeds of a task and a method in one process, which on a GPU
+            updates them in one pass. Default: ``False``.
 
     Raises:
         ValueError: if one of the runs was begun with other settings.
         RuntimeError: if another queue works in this folder.
     """
 
-    def __init__(self, runs: Sequence[Run], folder: Path, *, jobs: int, attempts: int = 3) -> None:
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        folder: Path,
+        *,
+        jobs: int,
+        attempts: int = 3,
+        seeds_at_once: bool = False,
+    ) -> None:
         for run in runs:
             run.check_settings()
         self.runs, self.folder, self.jobs, self.attempts = runs, Path(folder), jobs, attempts
+        self.seeds_at_once = seeds_at_once
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.folder / ".lock")
         try:
@@ -200,8 +229,9 @@ class Sweep:
                 active = [run for run in self.runs if self.status(run) == "running"]
                 waiting = [run for run in self.runs if self.status(run) == "waiting"]
                 free = [run for run in waiting if not run.is_busy]
-                for run in free[: self.jobs - len(active)]:
-                    run.start(environ)
+                working = {run.process for run in active}
+                for runs in self._divided(free)[: self.jobs - len(working)]:
+                    start(runs, environ)
                 if time.monotonic() - written > 10:
                     self.write()
                     written = time.monotonic()
@@ -211,6 +241,15 @@ class Sweep:
                 time.sleep(1.0)
         finally:
             self.stop()
+
+    def _divided(self, runs: Sequence[Run]) -> list[list[Run]]:
+        """These runs, those together that share a process."""
+        shared: dict[tuple[Any, ...], list[Run]] = {}
+        for run in runs:
+            own = () if self.seeds_at_once else (run.seed,)
+            what = (run.task, run.goal, run.method, run.frames, run.has_begun)
+            shared.setdefault((*what, *own), []).append(run)
+        return list(shared.values())
 
     def status(self, run: Run) -> str:
         """waiting, running, finished, failed, or, of one not in this queue's hands, unfinished."""
@@ -222,7 +261,7 @@ class Sweep:
 
     def stop(self) -> None:
         """Ask what runs to save and end, wait for that, and write the table."""
-        active = [run.process for run in self.runs if self.status(run) == "running"]
+        active = {run.process for run in self.runs if self.status(run) == "running"}
         for process in active:
             process.send_signal(signal.SIGTERM)
         for process in active:
