@@ -5,10 +5,10 @@
     python benchmarks/seeds.py --seeds 16 --compile --device cuda
 
 One thread and CPU time, or with ``--device cuda`` the time until the GPU is done; both take turns
-in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make their updates as
-in training, 64 earned at a time: sampling, each seed's random numbers and its own state of the
-generators are included. A ratio is to the same seeds one after another; times the number of seeds,
-it is to one of them alone.
+in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make the 64 updates
+that a batch of frames earns as training makes them: sampling, each seed's random numbers and its
+own state of the generators are included. A ratio is to the same seeds one after another; times the
+number of seeds, it is to one of them alone.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ CONF = HERE / "conf"
 def main(config: DictConfig) -> None:
     with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
         runs = queue(config)
-        jobs = config.jobs or available_cores()
+        jobs = config.jobs or (1 if config.seeds_at_once else available_cores())
         options = {"attempts": config.attempts, "seeds_at_once": config.seeds_at_once}
         sweep = Sweep(runs, Path(config.out), jobs=jobs, **options)
     display = Display(sweep)
@@ -61,12 +61,14 @@ def main(config: DictConfig) -> None:
 
 
 def queue(config: DictConfig) -> list[Run]:
-    """The runs that a configuration asks for, seed by seed, so that early results compare."""
+    """The runs that a configuration asks for, seed by seed: early results of methods compare."""
     methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
     for name in ("tasks", "methods", "seeds"):
         value = config[name]
         if not isinstance(value, ListConfig) or not value:
             raise ValueError(f"{name} is {value!r}; it must be a list, such as {name}=[a,b].")
+    if len(set(config.seeds)) < len(config.seeds):
+        raise ValueError(f"seeds is {config.seeds}; it must be a list of different numbers.")
     for method in config.methods:
         check_choice("methods", method, methods)
     check_integer(1, frames=config.frames, attempts=config.attempts)

@@ -86,6 +86,16 @@ def test_an_ema_past_its_warm_up_is_pytorchs_and_copies_buffers():
     assert (ours.module.weight != model.weight).all() and (ours.module.running_mean == 8).all()
 
 
+def test_batches_may_have_any_size():
+    stage = learn_stage()
+    fill(stage)
+    stage.close()
+    for size in (1, 16, 8):
+        draws = stage.learner.inputs(stage.sample()[:size].unsqueeze(0))["draws"]
+        assert all(each.shape[:2] == (1, size) for each in draws.values())
+        stage.learner.update(stage.sample()[:size])
+
+
 def test_updates_on_several_batches_are_those_on_each_in_turn():
     at_once, in_turn = learn_stage(), learn_stage()
     fill(at_once)

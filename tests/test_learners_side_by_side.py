@@ -174,3 +174,14 @@ def test_learners_of_other_sizes_are_refused():
     with pytest.raises(ValueError, match="learners is empty"):
         SideBySide([])
     small.close(), large.close()
+
+
+@pytest.mark.parametrize("setting", ["learn.sac.lr=1e-2", "learn.sac.tau=0.5"])
+def test_learners_of_another_pace_are_refused(setting):
+    stages = [learn_stage(), learn_stage(None, setting)]
+    for stage in stages:
+        fill(stage)
+        stage.close()
+    inputs = [stage.learner.inputs(stage.samples(1)) for stage in stages]
+    with pytest.raises(ValueError, match="updates and rates differ"):
+        SideBySide([stage.learner for stage in stages]).updates(inputs)

@@ -78,7 +78,7 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
 
 @pytest.mark.slow
 def test_seeds_in_one_process_that_were_killed_go_on_together(tmp_path):
-    out = tmp_path / "a sweep"
+    out = tmp_path / "a sweep, (new)=1"
     what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0,1]", "frames=900", "jobs=1"]
     what += ["seeds_at_once=true", f"settings={' '.join(SMALL)}", f"out={out}"]
     process = subprocess.Popen([*RECIPE, *what], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
@@ -187,6 +187,7 @@ def test_two_queues_do_not_work_in_one_folder(tmp_path):
         ("frames=0", "frames is 0"),
         ("tasks=myoHandPose", "must be a list"),
         ("settings='learn.sac.rl=1'", r"learn.sac.rl"),
+        ("seeds=[0,0]", r"seeds is \[0, 0\]; it must be a list of different numbers"),
     ],
 )
 def test_a_mistake_is_told_before_anything_runs(override, words, recipe):

@@ -85,4 +85,8 @@ def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypat
         ends = together(works)
     assert [type(end) for end in ends] == [Interrupted, Interrupted]
     goes_on = [Experiment(resumed_config(run), resume=run).work(StopOnSignal()) for run in runs]
+    passes, updates = [], SideBySide.updates
+    count = lambda group, inputs: passes.append(len(inputs)) or updates(group, inputs)  # noqa: E731
+    monkeypatch.setattr(SideBySide, "updates", count)
     assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]
+    assert len(passes) > 5 and {*passes} == {2}  # they had stopped a batch apart

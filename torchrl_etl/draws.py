@@ -93,23 +93,23 @@ def recorded_draws() -> Iterator[list[Draw]]:
 def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
     """Draws what ``function`` would in so many calls, from the generators as they are.
 
-    What that is, which must be the same at all calls, is found out by the first, which runs
-    ``function``.
+    What that is, which must be the same for all arguments of a shape, is found out by the first
+    call with it, which runs ``function``.
 
     Examples:
         >>> draw = redrawn(lambda x: x + standard_normal(x))
         >>> [numbers.shape for numbers in draw(16, torch.zeros(2, 3))]
         [torch.Size([16, 2, 3])]
     """
-    known: list[Draw] | None = None
+    known: dict[tuple[torch.Size, ...], list[Draw]] = {}
 
     def draws(calls: int, *args: Any) -> list[Tensor]:
-        nonlocal known
-        if known is None:
+        shapes = tuple(each.shape for each in args)
+        if shapes not in known:
             with torch.random.fork_rng(), recorded_draws() as found, torch.no_grad():
                 function(*args)
-            known = found
-        return [draw(calls) for draw in known]
+            known[shapes] = found
+        return [draw(calls) for draw in known[shapes]]
 
     return draws
 

@@ -38,12 +38,12 @@ class GradientAdam(Adam):
 
     @property
     def moments(self) -> list[Tensor]:
-        """Both moments of each parameter that has any, in their order."""
+        """Both moments of each parameter, in their order."""
         return [state[key] for state in self._states for key in ("exp_avg", "exp_avg_sq")]
 
     @property
     def steps(self) -> list[Tensor]:
-        """The number of steps that each of these parameters has had."""
+        """The number of steps that each parameter has had."""
         return [state["step"] for state in self._states]
 
     def over(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
@@ -110,7 +110,7 @@ class GradientAdam(Adam):
         """As Adam begins where a parameter has its first gradient."""
         for parameter in self._parameters:
             if parameter not in self.state:
-                step = torch.zeros((), device=parameter.device)
+                step = torch.zeros((), dtype=torch.float32, device=parameter.device)
                 moments = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
                 self.state[parameter] = {"step": step, **moments}
 

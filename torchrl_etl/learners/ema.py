@@ -62,7 +62,7 @@ class WarmedUpEMA(AveragedModel):
 
     def over(self, other: Callable[[Tensor], Tensor]) -> WarmedUpEMA:
         """The same for other tensors than these; they share their number of updates."""
-        twin = copy(self)
+        twin = copy(self)  # with the very same buffer ``n_averaged``
         twin._parameters_of = tuple(list(map(other, each)) for each in self._parameters_of)
         twin._buffers_of = tuple(list(map(other, each)) for each in self._buffers_of)
         return twin

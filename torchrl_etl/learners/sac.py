@@ -138,6 +138,7 @@ class SACLearner:
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
+        self._factor = 1.0
         self._draw = redrawn(self.objective)
         self._gradients = compiled(self.gradients) if compile else self.gradients
         self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
@@ -157,10 +158,9 @@ class SACLearner:
     def inputs(self, batches: TensorDictBase) -> TensorDictBase:
         """What updates read [k]: under ``batch`` these batches [k, B], and under ``draws`` the
         random numbers of each, in the order in which the objective takes them."""
-        count = [len(batches)]
-        draws = dict(enumerate(self._draw(*count, batches[0])))
-        draws = TensorDict({f"{i}": numbers for i, numbers in draws.items()}, count)
-        return TensorDict({"batch": batches, "draws": draws}, count)
+        drawn = self._draw(len(batches), batches[0])
+        draws = TensorDict({f"{i}": each for i, each in enumerate(drawn)}, [len(batches)])
+        return TensorDict({"batch": batches, "draws": draws}, [len(batches)])
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
@@ -210,14 +210,25 @@ class SACLearner:
 
     def advance(self, frames: int, progress: float) -> None:
         """Set what depends on the number of frames, and on the share of all frames that it is."""
-        factor = 1.0 - (1.0 - self.lr_end) * min(1.0, progress)
+        self._factor = 1.0 - (1.0 - self.lr_end) * min(1.0, progress)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             if isinstance(group["lr"], Tensor):  # read by a CUDA graph
-                group["lr"].fill_(factor * rate)
+                group["lr"].fill_(self._factor * rate)
             else:
-                group["lr"] = factor * rate
+                group["lr"] = self._factor * rate
         for tell in self.on_frames:
             tell(frames)
+
+    @property
+    def num_updates(self) -> int:
+        """Updates up to now, each with a step of the EMA."""
+        return int(self.ema.n_averaged)
+
+    @property
+    def pace(self) -> tuple[float, ...]:
+        """How far a step goes now: number of updates, learning rates, rates of targets and EMA."""
+        rates = [self._factor * rate for rate in self._rates]
+        return self.num_updates, *rates, *(target.eps for target in self.targets), self.ema.decay
 
     @property
     def state(self) -> list[Tensor]:

@@ -27,7 +27,8 @@ class SideBySide:
             updates; weights, statistics and whatever else their modules hold as buffers may differ.
 
     Raises:
-        ValueError: if there is no learner, or one has parameters of other shapes.
+        ValueError: if there is no learner, or one has parameters of other shapes; at an update if
+            learners differ in how many they have had, or in learning rates, tau or EMA decay.
 
     Examples:
         >>> import torch
@@ -123,6 +124,11 @@ class SideBySide:
 
     @torch.no_grad()
     def _take(self) -> None:
+        if len(paces := {learner.pace for learner in self.learners}) > 1:
+            raise ValueError(
+                f"The learners' updates and rates differ ({'; '.join(map(str, sorted(paces)))}); "
+                "update side by side those that are equally far and have the same settings."
+            )
         first = self.learners[0].optimizer
         torch._foreach_copy_(*self._rows_and_own())
         torch._foreach_copy_(self._all.optimizer.steps, first.steps)

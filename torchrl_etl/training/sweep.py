@@ -110,6 +110,16 @@ class Run:
         return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
     @property
+    def settings(self) -> tuple[str, ...]:
+        """Of its command, without the seed."""
+        return tuple(each for each in self.command[1:] if not each.startswith("seed="))
+
+    @property
+    def stem(self) -> str:
+        """Its path without the seed at the end."""
+        return str(self.path).removesuffix(str(self.seed))
+
+    @property
     def log(self) -> Path:
         """What its process prints: into the folder of the first of several seeds."""
         return (self.leader or self).path / "log.txt"
@@ -137,16 +147,17 @@ class Run:
 
 
 def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
-    """Begin a run, or several that differ in their seeds, in one process; or go on where an earlier
-    start was stopped, if they have begun."""
+    """Begin a run, or several that differ in their seeds alone, in one process; or go on where an
+    earlier start was stopped, if they have begun."""
     first, *others = runs
     script, *settings = first.command
     if first.has_begun:
-        folders = ",".join(str(run.path) for run in runs)
-        where, settings = f"resume=[{folders}]" if others else f"resume={folders}", []
+        # Hydra's grammar allows no comma or bracket, and more, in a list without quotation marks.
+        folders = ["'" + str(run.path).replace("'", "\\'") + "'" for run in runs]
+        where, settings = f"resume=[{','.join(folders)}]" if others else f"resume={first.path}", []
     elif others:
-        where = f"run_dir={str(first.path).removesuffix(str(first.seed))}${{seed}}"
-        settings = [each for each in settings if not each.startswith("seed=")]
+        where = f"run_dir={first.stem}${{seed}}"
+        settings = list(first.settings)
         settings.append(f"seeds=[{','.join(str(run.seed) for run in runs)}]")
     else:
         where = f"run_dir={first.path}"
@@ -186,8 +197,9 @@ class Sweep:
     Keyword Args:
         jobs (int): processes at a time.
         attempts (int): starts of one run, at most. Default: 3.
-        seeds_at_once (bool): all seeds of a task and a method in one process, which on a GPU
-            updates them in one pass. Default: ``False``.
+        seeds_at_once (bool): runs that differ in their seeds alone, and whose paths end with them,
+            in one process, which on a GPU updates them in one pass; one that did not end well there
+            is tried again by itself. Default: ``False``.
 
     Raises:
         ValueError: if one of the runs was begun with other settings.
@@ -228,9 +240,9 @@ class Sweep:
             while True:
                 active = [run for run in self.runs if self.status(run) == "running"]
                 waiting = [run for run in self.runs if self.status(run) == "waiting"]
-                free = [run for run in waiting if not run.is_busy]
-                working = {run.process for run in active}
-                for runs in self._divided(free)[: self.jobs - len(working)]:
+                groups = self._divided(waiting)
+                free = [runs for runs in groups if not any(run.is_busy for run in runs)]
+                for runs in free[: self.jobs - len({run.process for run in active})]:
                     start(runs, environ)
                 if time.monotonic() - written > 10:
                     self.write()
@@ -246,9 +258,9 @@ class Sweep:
         """These runs, those together that share a process."""
         shared: dict[tuple[Any, ...], list[Run]] = {}
         for run in runs:
-            own = () if self.seeds_at_once else (run.seed,)
-            what = (run.task, run.goal, run.method, run.frames, run.has_begun)
-            shared.setdefault((*what, *own), []).append(run)
+            alone = run.starts or not self.seeds_at_once or run.stem == str(run.path)
+            what = run.stem, run.settings, run.frames, run.has_begun
+            shared.setdefault((*what, run.seed if alone else None), []).append(run)
         return list(shared.values())
 
     def status(self, run: Run) -> str:

@@ -19,6 +19,7 @@ __all__ = ["together"]
 def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     """Do all works in turns, and updates that are due at the same time together.
 
+    A work that is ahead of others in its stage, as one that was resumed can be, waits for them.
     Each work finds the random generators as it left them: it ends with the numbers of
     :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
     the others to go on.
@@ -41,8 +42,11 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
         for run in runs:
             run.go_on(None)
         while waiting := [run for run in runs if run.due is not None]:
+            learners = {run.due.learner for run in waiting}
+            for done in [group for group in groups if learners.isdisjoint(group)]:
+                del groups[done]  # which holds a copy of all their weights
             alike = defaultdict(list)
-            for run in waiting:
+            for run in _behind(waiting):
                 alike[run.alike].append(run)
             for each in alike.values():
                 _update(each, groups)
@@ -61,10 +65,9 @@ class _Run(Generic[Result]):
         self.result: Result | BaseException
 
     @property
-    def alike(self) -> tuple[str, int, int]:
-        """What is due to runs that can be updated together: the stage, how many updates, and after
-        how many."""
-        return self.due.stage, len(self.due.inputs), int(self.due.learner.ema.n_averaged)
+    def alike(self) -> tuple[Any, ...]:
+        """What is the same for runs that can be updated together."""
+        return self.due.stage, self.due.inputs["batch"].shape, self.due.learner.pace
 
     def __enter__(self) -> None:
         GlobalRNGState().load_state_dict(self.random)
@@ -80,6 +83,15 @@ class _Run(Generic[Result]):
                 self.due, self.result = None, end.value
             except (Exception, Interrupted) as error:
                 self.due, self.result = None, error
+
+
+def _behind(runs: Sequence[_Run]) -> list[_Run]:
+    """Those that have had the fewest updates in their stage."""
+    fewest: dict[str, int] = {}
+    for run in runs:
+        stage, updates = run.due.stage, run.due.learner.num_updates
+        fewest[stage] = min(updates, fewest.get(stage, updates))
+    return [run for run in runs if run.due.learner.num_updates == fewest[run.due.stage]]
 
 
 def _update(runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]) -> None:
