@@ -140,8 +140,7 @@ class SACLearner:
         self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
         self._factor = 1.0
         self._draw = redrawn(self.objective)
-        self._gradients = compiled(self.gradients) if compile else self.gradients
-        self._step = cuda_graph(self.step) if compile and self.device.type == "cuda" else self.step
+        self._step_along(self.gradients)
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Learn from a batch of transitions [B]; returns scalars to log."""
@@ -237,15 +236,23 @@ class SACLearner:
         found = *self.parameters, *followers, *self.ema.tensors, *self.optimizer.moments
         return list({id(tensor): tensor for tensor in found}.values())
 
-    def over(self, other: Callable[[Tensor], Tensor]) -> SACLearner:
-        """Takes the same steps along gradients, with other parameters, targets and EMA."""
+    def over(
+        self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Any]
+    ) -> SACLearner:
+        """Makes the same updates along other gradients, of other parameters, targets and EMA."""
         twin = copy(self)
         twin.parameters = list(map(other, self.parameters))
         twin.unit_rows = list(map(other, self.unit_rows))
         twin.optimizer = self.optimizer.over(other)
         twin.targets = [target.over(other) for target in self.targets]
         twin.ema = self.ema.over(other)
+        twin._step_along(gradients)
         return twin
+
+    def _step_along(self, gradients: Callable[[TensorDictBase], Any]) -> None:
+        self._gradients = compiled(gradients) if self.compile else gradients
+        graphed = self.compile and self.device.type == "cuda"
+        self._step = cuda_graph(self.step) if graphed else self.step
 
     @property
     def parts(self) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.sac import SACLearner
 
 __all__ = ["SideBySide"]
@@ -61,12 +60,8 @@ class SideBySide:
                 "updated side by side only where observations, actions and networks agree."
             )
         self.learners = list(learners)
-        first = learners[0]
         self._stacks: dict[int, Tensor] = {}
-        self._all = first.over(self._stack)
-        self._gradients = compiled(self.gradients) if first.compile else self.gradients
-        graphed = first.compile and first.device.type == "cuda"
-        self._step = cuda_graph(self.step) if graphed else self.step
+        self._all = learners[0].over(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
         """Every learner learns from its own :meth:`SACLearner.inputs` [k], one after the other.
@@ -74,19 +69,10 @@ class SideBySide:
         Returns:
             list of TensorDictBase: the scalars [k] of each.
         """
-        scalars = []
         self._take()
-        for each in torch.stack(list(inputs), 1).unbind(0):
-            scalars.append(self._step(each))
-            self._all.ema.follow()
+        scalars = self._all.updates(torch.stack(list(inputs), 1))
         self._give_back()
-        return list(torch.stack(scalars).unbind(1))
-
-    def step(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Everything of an update that runs on the device; returns scalars [seeds]."""
-        gradients, scalars = self._gradients(inputs)
-        self._all.descend(gradients)
-        return scalars
+        return list(scalars.unbind(1))
 
     def gradients(self, inputs: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
         """Gradients [seeds, ...] in the order of a learner's ``parameters``, and scalars [seeds].
