@@ -20,7 +20,7 @@ from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
 from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED
-from torchrl_etl.training.resumed import check_prefix, parse_override
+from torchrl_etl.training.resumed import check_prefix, parse_override, quoted
 
 with extra("recipes"):
     from omegaconf import DictConfig, OmegaConf
@@ -152,7 +152,7 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
         >>> quote_paths(["run_dir=/my (new) runs/a", "seed=1"], "run_dir")
         ["run_dir='/my (new) runs/a'", 'seed=1']
     """
-    quoted = []
+    result = []
     for argument in arguments:
         key, _, value = argument.partition("=")
         is_list = value.startswith("[") and value.endswith("]")
@@ -160,11 +160,10 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
             if value[0] in "'\"":
                 value = value[0] + os.path.expanduser(value[1:])
             else:
-                value = os.path.expanduser(value).replace("'", "\\'")
-                value = f"'{value}'"
+                value = quoted(os.path.expanduser(value))
             argument = f"{key}={value}"
-        quoted.append(argument)
-    return quoted
+        result.append(argument)
+    return result
 
 
 @contextmanager

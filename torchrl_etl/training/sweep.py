@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 
 from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
+from torchrl_etl.training.resumed import quoted
 from torchrl_etl.training.run_folder import RunFolder
 
 __all__ = ["Run", "Sweep", "end_with_parent"]
@@ -152,13 +153,11 @@ def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
     first, *others = runs
     script, *settings = first.command
     if first.has_begun:
-        # Hydra's grammar allows no comma or bracket, and more, in a list without quotation marks.
-        folders = ["'" + str(run.path).replace("'", "\\'") + "'" for run in runs]
-        where, settings = f"resume=[{','.join(folders)}]" if others else f"resume={first.path}", []
+        folders = ",".join(quoted(str(run.path)) for run in runs)
+        where, settings = f"resume=[{folders}]" if others else f"resume={first.path}", []
     elif others:
         where = f"run_dir={first.stem}${{seed}}"
-        settings = list(first.settings)
-        settings.append(f"seeds=[{','.join(str(run.seed) for run in runs)}]")
+        settings = [*first.settings, f"seeds=[{','.join(str(run.seed) for run in runs)}]"]
     else:
         where = f"run_dir={first.path}"
     for run in runs:
