@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -15,7 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
-from tests.commands import command, recipe_module
+from tests.commands import begun, command, process, recipe_module
 from tests.configs import CONF, ROOT, TINY
 from torchrl_etl.analysis.sweep_results import COLUMNS
 from torchrl_etl.training import Run, Sweep
@@ -24,12 +23,24 @@ SETTINGS = [o for o in TINY if not o.startswith(("env=", "progress=", "pictures=
 SMALL = [*SETTINGS, "explore.frames=320", "evaluation.every=200", "checkpoint.every=160"]
 
 
-RECIPE = [sys.executable, str(ROOT / "recipes" / "sweep.py")]
-
-
 def results(out: Path) -> list[dict[str, str]]:
     with (out / "results.csv").open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def results_of_a_queue_that_was_killed(arguments, out: Path, *runs: str) -> list[dict[str, str]]:
+    """Kill it as soon as these runs have saved once, and start it again."""
+    running = begun("sweep.py", *arguments, cwd=out.parent)
+    deadline = time.monotonic() + 120
+    while not all(list((out / run).glob("checkpoints/learn/*/seal.json")) for run in runs):
+        assert running.poll() is None, running.stdout.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    running.kill()
+    running.wait()
+    ended = process("sweep.py", *arguments, cwd=out.parent)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return results(out)
 
 
 def script(tmp_path: Path, text: str) -> list[str]:
@@ -48,21 +59,7 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
     out = tmp_path / "a sweep"
     what = ["tasks=[overactuated]", "methods=[sac,etl]", "seeds=[0]", "frames=900", "jobs=2"]
     arguments = [*what, f"settings={' '.join(SMALL)}", f"out={out}"]
-    process = subprocess.Popen(
-        [*RECIPE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
-    first = out / "overactuated-sac-seed0" / "checkpoints" / "learn"
-    deadline = time.monotonic() + 120
-    while not list(first.glob("*/seal.json")):
-        assert process.poll() is None, process.stdout.read().decode()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-
-    ended = subprocess.run([*RECIPE, *arguments], capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    rows = results(out)
+    rows = results_of_a_queue_that_was_killed(arguments, out, "overactuated-sac-seed0")
     assert {row["method"] for row in rows} == {"sac", "etl"}
     assert {row["status"] for row in rows} == {"finished"}
     frames = {m: [int(row["frames"]) for row in rows if row["method"] == m] for m in ("sac", "etl")}
@@ -81,24 +78,13 @@ def test_seeds_in_one_process_that_were_killed_go_on_together(tmp_path):
     out = tmp_path / "a sweep, (new)=1"
     what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0,1]", "frames=900", "jobs=1"]
     what += ["seeds_at_once=true", f"settings={' '.join(SMALL)}", f"out={out}"]
-    process = subprocess.Popen([*RECIPE, *what], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    runs = [out / f"overactuated-sac-seed{seed}" for seed in (0, 1)]
-    deadline = time.monotonic() + 120
-    while not all(list((run / "checkpoints" / "learn").glob("*/seal.json")) for run in runs):
-        assert process.poll() is None, process.stdout.read().decode()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-
-    ended = subprocess.run([*RECIPE, *what], capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    rows = results(out)
+    runs = [f"overactuated-sac-seed{seed}" for seed in (0, 1)]
+    rows = results_of_a_queue_that_was_killed(what, out, *runs)
     assert {(row["seed"], row["status"]) for row in rows} == {("0", "finished"), ("1", "finished")}
     assert [row["return"] for row in rows if row["seed"] == "0"] != [
         row["return"] for row in rows if row["seed"] == "1"
     ]
-    assert (runs[0] / "log.txt").exists() and not (runs[1] / "log.txt").exists()
+    assert [(out / run / "log.txt").exists() for run in runs] == [True, False]
 
 
 def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
