@@ -19,8 +19,8 @@ import gymnasium
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
-from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED
-from torchrl_etl.training.resumed import check_prefix, parse_override, quoted
+from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED, quoted
+from torchrl_etl.training.resumed import check_prefix, parse_override
 
 with extra("recipes"):
     from omegaconf import DictConfig, OmegaConf

@@ -24,6 +24,7 @@ __all__ = [
     "bfloat16_warning",
     "check_device",
     "of_each_seed",
+    "quoted",
     "validate",
 ]
 
@@ -164,6 +165,17 @@ def of_each_seed(config: DictConfig) -> list[DictConfig]:
         for own in configs:
             own.run_dir = f"{own.run_dir}/seed{own.seed}"
     return configs
+
+
+def quoted(value: str) -> str:
+    """A value of which Hydra reads nothing but the characters, in a list too.
+
+    Examples:
+        >>> from torchrl_etl.training.resumed import parse_override
+        >>> parse_override(f"run_dir={quoted('runs/a, (new)')}").value()
+        'runs/a, (new)'
+    """
+    return "'" + value.replace("'", "\\'") + "'"
 
 
 def bfloat16_warning(config: DictConfig) -> str | None:

@@ -19,7 +19,7 @@ with extra("recipes"):
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-__all__ = ["check_prefix", "parse_override", "quoted", "resumed_config"]
+__all__ = ["check_prefix", "parse_override", "resumed_config"]
 
 # Every release had these, and the last of them ends the file: one that was cut short lacks it.
 _SECTIONS = ("explore", "learn", "checkpoint", "collector", "method")
@@ -77,16 +77,6 @@ def parse_override(override: str) -> Override:
     except HydraException as error:
         reason = f"{error}".splitlines()[0]
         raise ValueError(f"{override!r} is not of the form key=value ({reason}).") from error
-
-
-def quoted(value: str) -> str:
-    """A value of which Hydra reads nothing but the characters, in a list too.
-
-    Examples:
-        >>> parse_override(f"run_dir={quoted('runs/a, (new)')}").value()
-        'runs/a, (new)'
-    """
-    return "'" + value.replace("'", "\\'") + "'"
 
 
 def check_prefix(override: Override, known: bool) -> None:

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
-from torchrl_etl.training.resumed import quoted
+from torchrl_etl.training.config import quoted
 from torchrl_etl.training.run_folder import RunFolder
 
 __all__ = ["Run", "Sweep", "end_with_parent"]
