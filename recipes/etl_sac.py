@@ -39,7 +39,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.in_processes import in_processes
 from torchrl_etl.layout import choose_layout
 from torchrl_etl.training import Interrupted, resumed_config, together
-from torchrl_etl.training.config import of_each_seed
+from torchrl_etl.training.config import of_each_seed, to_go_on
 from torchrl_etl.training.loop import StopOnSignal
 
 CONF = Path(__file__).parent / "conf"
@@ -78,8 +78,7 @@ def main(config: DictConfig) -> None:
             raise failure
     stopped = [folder for folder, end in ends if isinstance(end, Interrupted)]
     if stopped:
-        folders = stopped[0] if len(stopped) == 1 else f"[{','.join(map(str, stopped))}]"
-        command = shlex.join(["python", sys.argv[0], f"resume={folders}"])
+        command = shlex.join(["python", sys.argv[0], to_go_on(stopped)])
         with suppress(OSError):  # the terminal may be gone
             print(f"Stopped and saved. To go on: {command}", flush=True)
     if failures or stopped:

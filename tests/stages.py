@@ -44,6 +44,11 @@ def fill(stage, batches: int = 6) -> None:
         stage.collect()
 
 
+def prepared(stage):
+    """A batch as the objective's losses read it."""
+    return stage.learner.objective.prepare(stage.sample())
+
+
 def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
     return {key: value.clone() for key, value in module.state_dict().items()}
 

@@ -49,7 +49,7 @@ def test_synergies_that_are_fitted_once_get_no_updates():
     found = explorer(NOISE, "synergies=pca")
     fill(found.stage)
     assert alone(found.stage.learn()) is None and found.stage.progress.updates == 0
-    assert found.condense().num_synergies == 2
+    assert alone(found.condense()).num_synergies == 2
     found.stage.close()
 
 

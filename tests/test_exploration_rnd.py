@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.stages import changed, explorer, fill, goes_on_after_a_load, snapshot
+from tests.stages import changed, explorer, fill, goes_on_after_a_load, prepared, snapshot
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.exploration import RNDExploration
 from torchrl_etl.learners import SideBySide
@@ -24,7 +24,7 @@ def found():
 def test_the_policy_is_paid_with_the_bonus_and_reads_the_observation_alone(found):
     assert found.exploration.reward == "intrinsic_reward"
     assert found.stage.learner.objective.sac.tensor_keys.reward == "intrinsic_reward"
-    batch = found.stage.sample()
+    batch = prepared(found.stage)
     assert "direction" not in batch.keys() and batch["next", "intrinsic_reward"].shape == (32, 1)
     assert found.exploration.embed(batch) is None
 
@@ -41,11 +41,11 @@ def test_one_update_moves_policy_predictor_and_gmvae_but_not_the_random_network(
 
 def test_only_the_terms_loss_reaches_the_predictor(found):
     loss, objective = found.exploration.loss, found.stage.learner.objective
-    batch = found.stage.sample()
+    batch = prepared(found.stage)
     parameters = list(loss.predictor_network.parameters())
     own = torch.autograd.grad(loss(batch)["loss_predictor"], parameters)
     assert all(gradient.abs().sum() > 0 for gradient in own)
-    sac = objective.sac(objective.prepare(batch))
+    sac = objective.sac(batch)
     total = sac["loss_actor"] + sac["loss_qvalue"]
     assert torch.autograd.grad(total, parameters, allow_unused=True) == (None,) * len(parameters)
 
@@ -89,6 +89,11 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
         alone = found.stage.learner.update(batch)
         for key in ("loss_predictor", "loss_actor", "loss_qvalue"):
             torch.testing.assert_close(scalars[key], alone[key])
+    for one, other in zip(*twins, strict=True):
+        ours, theirs = (found.stage.learner.statistics for found in (one, other))
+        assert ours["transforms.0.deviation.weight"] > 0 and ours["networks.0.obs_rms.count"] > 1
+        for name, value in theirs.items():
+            torch.testing.assert_close(ours[name], value)
 
 
 def test_a_resumed_stage_goes_on_with_the_same_numbers(tmp_path):

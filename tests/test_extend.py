@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from tests.configs import CONF, ROOT, tiny
-from tests.stages import changed, fill, goes_on_after_a_load, snapshot
+from tests.stages import changed, fill, goes_on_after_a_load, prepared, snapshot
 from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
@@ -140,7 +140,7 @@ def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(conf):
     found.stage.restart_collection()
     for _ in range(6):
         found.stage.collect()
-    batch, loss = found.stage.sample(), found.exploration.loss
+    batch, loss = prepared(found.stage), found.exploration.loss
     inputs = torch.cat([batch["observation"], batch["action"]], -1)
     error = (loss.model(inputs) - batch["next", "observation"]).square().sum(-1, keepdim=True)
     torch.testing.assert_close(batch["next", "surprise"], error)

@@ -13,8 +13,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tests.configs import CONF, ROOT
-from tests.stages import explorer, fill
+from tests.stages import explorer, fill, prepared
 from torchrl_etl.methods.explorer import Explorer
+from torchrl_etl.training import alone
 
 PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")
 TEST = re.compile(r"(tests/\w+\.py)::(\w+)")
@@ -102,7 +103,7 @@ def test_every_setting_on_the_page_is_accepted_as_written(setting):
 def test_the_paper_preset_reaches_the_parts_it_is_about():
     paper = explored("faithful=paper")
     paper.stage.update()
-    (relabel,), (bonus,) = paper.relabel, paper.exploration.batch_transforms()
+    (relabel,), (bonus,) = paper.relabel, paper.stage.learner.objective.transforms
     assert bonus.deviation is None
     assert paper.stage.learner.objective.terms[0].loss.regularizer == "literal"
     assert relabel.share == 0
@@ -120,7 +121,7 @@ def test_embedding_size_follows_the_synergies_unless_given():
 
 def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
     stage = explored().stage
-    batch = stage.sample()
+    batch = prepared(stage)
     objective = stage.learner.objective
 
     def metric_and_critic(key: str, factor: float) -> tuple[float, float]:
@@ -144,7 +145,7 @@ def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
 def test_the_gmvae_is_trained_on_after_the_last_frame_unless_told_not_to(updates, trained):
     found = explored(f"explore.fit.final_updates={updates}")
     before = found.model.model.prior_loc.clone()
-    found.condense()
+    alone(found.condense())
     assert (not torch.equal(found.model.model.prior_loc, before)) is trained
 
 

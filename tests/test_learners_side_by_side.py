@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
+from torchrl.envs.transforms import Transform
 
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
@@ -13,7 +14,7 @@ from torchrl_etl.baselines import make_dynsyn_actor, set_frames
 from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
-from torchrl_etl.modules import make_critic
+from torchrl_etl.modules import make_actor, make_critic
 
 SEEDS = (0, 1)
 MAKERS = {
@@ -26,6 +27,8 @@ MAKERS = {
         None, *RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]", *settings
     ),
     "stage 1": lambda *settings: explorer(*settings).stage,
+    "stage 1, RND": lambda *settings: explorer("exploration=rnd", *settings).stage,
+    "stage 1, synergies alone": lambda *settings: explorer("exploration=noise", *settings).stage,
     "stage 1, METRA": lambda *settings: explorer("exploration=metra", *settings).stage,
 }
 
@@ -49,8 +52,9 @@ def taken(learners):
 def assert_gradients_are_those_of_each(learners, batches):
     read = inputs(learners, batches)
     alone = [learner.gradients(own[0]) for learner, own in zip(learners, read, strict=True)]
-    together, scalars = taken(learners).gradients(torch.cat(read))
-    for seed, ((expected, logged), log) in enumerate(zip(alone, scalars.unbind(0), strict=True)):
+    together, scalars, statistics = taken(learners).gradients(torch.cat(read))
+    for seed, (expected, logged, changed) in enumerate(alone):
+        log = scalars[seed]
         for one, stack in zip(expected, together, strict=True):
             other = None if stack is None else stack[seed]
             assert (one is None or not one.any()) if other is None else True
@@ -58,6 +62,8 @@ def assert_gradients_are_those_of_each(learners, batches):
                 torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-4)
         for key, value in logged.items():
             torch.testing.assert_close(log[key], value, rtol=1e-3, atol=1e-5)
+        for one, stack in zip(changed, statistics, strict=True):
+            torch.testing.assert_close(stack[seed], one, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
@@ -67,7 +73,7 @@ def test_gradients_of_stacked_learners_are_those_of_each(make):
         fill(stage)
         stage.close()
     batches = [stage.sample() for stage in stages]
-    assert_gradients_are_those_of_each([stage.learner for stage in stages], batches)
+    assert_gradients_are_those_of_each([stage.updated for stage in stages], batches)
 
 
 def test_stacked_learners_have_each_its_own_groups_of_muscles():
@@ -122,16 +128,16 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
         fill(stage)
         stage.close()
     batches = [stage.sample() for stage in stages]
-    learners = [stage.learner for stage in stages]
+    learners = [stage.updated for stage in stages]
     read = torch.cat(inputs(learners, batches))
     with torch.no_grad():  # each its own, also of what is no network
-        stages[1].learner.objective.sac.log_alpha += 1
-        if (normalizer := stages[1].learner.objective.normalizer) is not None:
+        stages[1].updated.objective.sac.log_alpha += 1
+        if (normalizer := stages[1].updated.objective.normalizer) is not None:
             normalizer.mean += 1
     group = taken(learners)
-    expected, _ = group.gradients(read)
-    found, _ = compiled(group.gradients)(read)
-    for one, other in zip(expected, found, strict=True):
+    expected, _, changed = group.gradients(read)
+    found, _, also = compiled(group.gradients)(read)
+    for one, other in zip((*expected, *changed), (*found, *also), strict=True):
         torch.testing.assert_close(other, one)
 
 
@@ -140,7 +146,7 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
 def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(name, traced_only):
     stage = MAKERS[name]("actor.hidden=[16,16]")
     fill(stage)
-    learner = stage.learner
+    learner = stage.updated
     read = learner.inputs(stage.samples(1))[0]
     stage.close()
     gradients = compiled(learner.gradients)
@@ -148,8 +154,8 @@ def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(
         state = learner.objective.state_dict()
         changed = {key: factor * value for key, value in state.items() if value.is_floating_point()}
         learner.objective.load_state_dict(state | changed)
-        outs = [call(read)[0] for call in (gradients, learner.gradients)]
-        for found, expected in zip(*outs, strict=True):
+        outs = [call(read) for call in (gradients, learner.gradients)]
+        for found, expected in zip(*((*out[0], *out[2]) for out in outs), strict=True):
             torch.testing.assert_close(found, expected)
 
 
@@ -163,6 +169,38 @@ def test_finding_out_what_is_drawn_draws_nothing():
     second = learner.inputs(batch.unsqueeze(0))
     assert len(first["draws"].keys()) and (first == second).all()
     stage.close()
+
+
+class Secretive(Transform):
+    """Pays by a network that nobody is told of."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.pay = network.forward  # no submodule
+
+    def forward(self, batch):
+        return batch.set(("next", "reward"), self.pay(batch["observation"]).detach())
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_transform_that_reads_another_seeds_network_is_refused(told):
+    learners, spec = [], Bounded(-1, 1, shape=(2,))
+    for _ in SEEDS:
+        transform = Secretive(network := torch.nn.Linear(3, 1))
+        if told:
+            transform.networks = (network,)
+        actor = make_actor({"observation": 3}, spec)
+        critic = make_critic({"observation": 3, "action": 2})
+        learners.append(SACLearner(actor, critic, action_spec=spec, transforms=[transform]))
+    end = torch.zeros(1, 32, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(1, 32, 3), "done": end, "terminated": end}
+    entries = {"observation": torch.randn(1, 32, 3), "action": torch.zeros(1, 32, 2)}
+    batches = TensorDict({**entries, "next": following}, [1, 32])
+    inputs = [learner.inputs(batches) for learner in learners]
+    if told:
+        return SideBySide(learners).updates(inputs)
+    with pytest.raises(ValueError, match="Secretive gives another reward than alone"):
+        SideBySide(learners).updates(inputs)
 
 
 def test_learners_of_other_sizes_are_refused():
@@ -182,4 +220,4 @@ def test_learners_of_another_pace_are_refused(setting):
         stage.close()
     inputs = [stage.learner.inputs(stage.samples(1)) for stage in stages]
     with pytest.raises(ValueError, match="updates and rates differ"):
-        SideBySide([stage.learner for stage in stages]).updates(inputs)
+        SideBySide([stage.updated for stage in stages]).updates(inputs)

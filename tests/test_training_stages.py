@@ -11,7 +11,8 @@ import torch
 from tensordict import TensorDict
 
 from tests.configs import RESIDUAL, tiny
-from tests.stages import changed, explorer, fill, learn_stage, snapshot
+from tests.stages import changed, explorer, fill, learn_stage, prepared, snapshot
+from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
@@ -103,7 +104,7 @@ def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
 
     def bonus_and_expected():
         torch.manual_seed(0)
-        batch = stage.sample()
+        batch = prepared(stage)
         with torch.no_grad():
             phi, phi_next = (
                 found.exploration.encoder.module(batch.get(key))
@@ -145,6 +146,38 @@ def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
     expected = {"policy": now.tanh(), "mean": batch["loc"].tanh(), "sampled": batch["action"]}
     torch.testing.assert_close(found.actions(), expected[actions], atol=1e-5, rtol=1e-5)
     stage.close()
+
+
+def test_synergies_see_what_the_policy_does_on_normalized_observations():
+    found = explorer("explore.sac.normalize_observations=true", "exploration.relabel=0")
+    fill(found.stage)
+    rows = found.stage.buffer.storage[:]
+    with torch.no_grad():
+        expected = found.stage.learner.behavior(rows)["loc"].tanh()
+    torch.testing.assert_close(found.actions(), expected, atol=1e-5, rtol=1e-5)
+    assert alone(found.condense()).num_synergies == 2
+    found.stage.close()
+
+
+def test_updates_after_the_last_frame_are_adams_steps_of_the_synergy_model_alone():
+    found, twin = explorer(), explorer()  # of the same seed
+    fill(found.stage)
+    learner = found.stage.learner
+    others = learner.objective.sac, learner.ema, found.exploration.encoder
+    before = [snapshot(part) for part in others]
+    inputs = found.fitter.inputs(found.stage.samples(3))
+    found.fitter.updates(inputs)
+    adam = torch.optim.Adam(twin.model.model.parameters(), lr=found.term.lr)
+    for each in inputs.unbind(0):
+        adam.zero_grad()
+        with given_draws(each["draws"][name] for name in sorted(each["draws"].keys())):
+            twin.term(each["batch"])[0].backward()
+        adam.step()
+    for name, weight in twin.model.model.state_dict().items():
+        torch.testing.assert_close(found.model.model.state_dict()[name], weight)
+    assert not any(changed(part, was) for part, was in zip(others, before, strict=True))
+    assert {int(step) for step in learner.optimizer.steps} == {0, 3} and learner.num_updates == 0
+    found.stage.close(), twin.stage.close()
 
 
 def test_an_update_learns_for_directions_that_nobody_followed():
@@ -239,7 +272,7 @@ def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
     fill(first)
     for _ in range(3):
         first.update()
-    decoder = found.condense()
+    decoder = alone(found.condense())
     before = copy.deepcopy([snapshot(found.exploration.encoder), snapshot(found.model.model)])
     second = learn_stage(decoder, "learn.decoder.lr=1e-2")
     fill(second)
@@ -332,7 +365,7 @@ def test_a_compiled_update_is_the_same_update():
         torch.manual_seed(0)
         outs.append(stage.learner._gradients(stage.learner.inputs(batch.unsqueeze(0))[0]))
         stage.close()
-    (eager, logged), (compiled, logged_too) = outs
+    (eager, logged, _), (compiled, logged_too, _) = outs
     for one, two in zip(eager, compiled, strict=True):
         torch.testing.assert_close(two, one, rtol=1e-3, atol=1e-5)
     for key, value in logged.items():

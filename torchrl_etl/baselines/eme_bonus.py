@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_etl import functional
 from torchrl_etl.baselines.reward_ensemble import diversity_scale
@@ -119,6 +119,10 @@ class EMEBonus(TransitionReward):
         self.deviation = RunningDeviation(decay) if normalize else None
         self.reward_deviation = RunningDeviation(decay) if normalize else None
         self.reward_key = unravel_key(reward_key)
+
+    @property
+    def networks(self) -> Sequence[nn.Module]:
+        return self.encoder, self.ensemble
 
     @property
     def _typed_by(self) -> NestedKey:

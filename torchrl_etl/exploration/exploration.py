@@ -50,9 +50,10 @@ class Exploration:
         return ()
 
     def batch_transforms(self) -> Sequence[Transform]:
-        """For the buffer, behind those that relabel: what else a sampled batch gets.
+        """For the learner: what each batch gets at its update, with all networks as they then are.
 
-        They see each sampled batch, with all networks as they are by then.
+        They are part of the compiled update: statistics are buffers, and networks that one reads
+        are submodules of it or in its attribute ``networks``.
         """
         return ()
 

@@ -16,7 +16,8 @@ class GradientAdam(Adam):
     """:class:`torch.optim.Adam` whose step takes gradients, all parameters in one operation.
 
     Adam walks its parameters in Python at every step. Between products that fill a processor's
-    caches this takes twice as long as the step itself; here they are walked once.
+    caches this takes twice as long as the step itself; here they are walked once for every choice
+    of parameters that have a gradient.
 
     Examples:
         >>> import torch
@@ -30,11 +31,25 @@ class GradientAdam(Adam):
         tensor([0.8000], requires_grad=True)
     """
 
-    _walked: list[tuple[dict[str, Any], list[int], list[list[Tensor]]]] | None = None
-
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
+        self.factor = 1.0
+        self._rates = [float(group["lr"]) for group in self.param_groups]
         self._begin()
+
+    @property
+    def rates(self) -> list[float]:
+        """The learning rates of now, without asking a GPU."""
+        return [self.factor * rate for rate in self._rates]
+
+    def scale_rates(self, factor: float) -> None:
+        """Set all learning rates to a share of those that they began with."""
+        self.factor = factor
+        for group, rate in zip(self.param_groups, self.rates, strict=True):
+            if isinstance(group["lr"], Tensor):  # read by a CUDA graph
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
 
     @property
     def moments(self) -> list[Tensor]:
@@ -64,18 +79,15 @@ class GradientAdam(Adam):
         for parameter, state in self.state.items():
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = _laid_out(state[moment], parameter)
-        self._walked = None
         self._begin()
 
     @torch.no_grad()
     def step_along(self, gradients: Sequence[Tensor | None]) -> None:
-        """One step along gradients in the order of the parameters; ``None`` leaves its parameter.
-
-        Which of them are ``None`` must not change.
-        """
-        if self._walked is None:
-            self._walk(gradients)
-        for group, at, (parameters, *moments, steps) in self._walked:
+        """One step along gradients in the order of the parameters; ``None`` leaves its own."""
+        absent = tuple(gradient is None for gradient in gradients)
+        if absent not in self._walked:
+            self._walked[absent] = self._walk(absent)
+        for group, at, (parameters, *moments, steps) in self._walked[absent]:
             beta1, beta2 = group["betas"]
             own = [gradients[i] for i in at]
             adam(
@@ -91,13 +103,6 @@ class GradientAdam(Adam):
                 **{name: group[name] for name in ("lr", "weight_decay", "eps", "maximize")},
             )
 
-    def step_once(self, gradients: Sequence[Tensor | None]) -> None:
-        """The same by Adam's own step, whichever are ``None``."""
-        for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            parameter.grad = None if gradient is None else _laid_out(gradient, parameter)
-        self.step()
-        self.zero_grad()
-
     @property
     def _parameters(self) -> list[Tensor]:
         return [parameter for group in self.param_groups for parameter in group["params"]]
@@ -108,23 +113,25 @@ class GradientAdam(Adam):
 
     def _begin(self) -> None:
         """As Adam begins where a parameter has its first gradient."""
+        self._walked: dict[tuple[bool, ...], list[tuple[dict[str, Any], list[int], Any]]] = {}
         for parameter in self._parameters:
             if parameter not in self.state:
                 step = torch.zeros((), dtype=torch.float32, device=parameter.device)
                 moments = {key: torch.zeros_like(parameter) for key in ("exp_avg", "exp_avg_sq")}
                 self.state[parameter] = {"step": step, **moments}
 
-    def _walk(self, gradients: Sequence[Tensor | None]) -> None:
-        parameters, index = self._parameters, 0
-        self._walked = []
+    def _walk(self, absent: Sequence[bool]) -> list[tuple[dict[str, Any], list[int], Any]]:
+        """Each group, which gradients are its own, and what a step of their parameters changes."""
+        parameters, index, walked = self._parameters, 0, []
         for group in self.param_groups:
-            at = [i for i, _ in enumerate(group["params"], index) if gradients[i] is not None]
+            at = [i for i, _ in enumerate(group["params"], index) if not absent[i]]
             index += len(group["params"])
             own = [parameters[i] for i in at]
             states = [self.state[parameter] for parameter in own]
             kept = [[state[key] for state in states] for key in ("exp_avg", "exp_avg_sq", "step")]
             if own:
-                self._walked.append((group, at, [own, *kept]))
+                walked.append((group, at, [own, *kept]))
+        return walked
 
 
 def _laid_out(tensor: Tensor, parameter: Tensor) -> Tensor:

@@ -49,7 +49,8 @@ class WarmedUpEMA(AveragedModel):
         """Take the weights of now into the average."""
         n = int(self.n_averaged)
         decay = min(self.decay, (1 + n) / (10 + n)) if n else 0.0
-        torch._foreach_lerp_(*self._parameters_of, 1 - decay)
+        if self._parameters_of[0]:
+            torch._foreach_lerp_(*self._parameters_of, 1 - decay)
         if self._buffers_of[0]:
             torch._foreach_copy_(*self._buffers_of)
         self.n_averaged += 1

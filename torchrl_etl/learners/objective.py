@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.envs.transforms import Transform
 
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm
@@ -20,10 +21,10 @@ NORMALIZED = "normalized_observation"
 
 
 class Objective(nn.Module):
-    """A function of parameters and a batch, without any state that it changes.
+    """A function of parameters and a batch, which changes nothing but :attr:`statistics`.
 
     Args:
-        sac (LeanSACLoss): the losses of actor, critics and temperature.
+        sac (LeanSACLoss, optional): the losses of actor, critics and temperature.
         actor (TensorDictModuleBase): that actor, for terms that ask it for actions.
         terms (sequence of Term): what is minimized beside them.
 
@@ -31,28 +32,37 @@ class Objective(nn.Module):
         normalizer (RunningNorm, optional): scales the observations that actor and critics read.
         return_scale (ReturnScale, optional): scales the reward that SAC learns on.
         reward (NestedKey): that reward, below ``"next"``. Default: ``"reward"``.
+        transforms (sequence of Transform): what each batch goes through first, with all networks
+            as they are by then; those that they read and do not hold are their ``networks``.
     """
 
     def __init__(
         self,
-        sac: LeanSACLoss,
+        sac: LeanSACLoss | None,
         actor: TensorDictModuleBase,
         terms: Sequence[Term] = (),
         *,
         normalizer: RunningNorm | None = None,
         return_scale: ReturnScale | None = None,
         reward: NestedKey = "reward",
+        transforms: Sequence[Transform] = (),
     ) -> None:
         super().__init__()
         self.sac, self.actor, self.terms = sac, actor, nn.ModuleList(terms)
         self.normalizer, self.return_scale, self.reward = normalizer, return_scale, reward
-        sac.set_keys(reward=reward)
+        self.transforms = nn.ModuleList(transforms)
+        read = (network for each in transforms for network in getattr(each, "networks", ()))
+        self.networks = nn.ModuleList(read)
+        if sac is not None:
+            sac.set_keys(reward=reward)
 
     def forward(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """The sum of all losses, and scalars to log; the batch [B] is left as it is."""
         batch = self.prepare(batch)
-        scalars = self.sac(batch)
-        loss = scalars["loss_actor"] + scalars["loss_qvalue"] + scalars["loss_alpha"]
+        loss, scalars = 0.0, TensorDict()
+        if self.sac is not None:
+            scalars = self.sac(batch)
+            loss = scalars["loss_actor"] + scalars["loss_qvalue"] + scalars["loss_alpha"]
         for term in self.terms:
             extra, logged = term(batch)
             loss = loss + extra
@@ -61,9 +71,21 @@ class Objective(nn.Module):
             scalars[self.reward] = batch["next", self.reward].mean()
         return loss, scalars
 
+    def only(self, *terms: Term) -> Objective:
+        """These terms alone, on the same observations."""
+        return Objective(None, self.actor, terms, normalizer=self.normalizer)
+
+    @property
+    def statistics(self) -> dict[str, Tensor]:
+        """What transforms may change, by their names in this module: buffers, as running means."""
+        changing = nn.ModuleDict({"transforms": self.transforms, "networks": self.networks})
+        return dict(changing.named_buffers())
+
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """The batch with observations and reward in the units of what was seen up to now."""
+        """The batch as transforms make it, observations and reward in units of those so far."""
         batch = batch.copy()
+        for transform in self.transforms:
+            batch = transform(batch)
         if self.normalizer is not None:
             for end in (batch, batch["next"]):
                 end[NORMALIZED] = self.normalizer(end["observation"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,7 +17,9 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.func import functional_call
 from torchrl.data import Bounded
+from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
 from torchrl_etl.draws import given_draws, redrawn
@@ -29,7 +31,10 @@ from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap, normalize_rows
 from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss, SynergySACLoss
 
-__all__ = ["SACLearner", "entropy_target", "from_observation"]
+__all__ = ["Gradients", "SACLearner", "entropy_target", "from_observation"]
+
+Gradients: TypeAlias = tuple[tuple[Tensor | None, ...], TensorDictBase, tuple[Tensor, ...]]
+"""Of each parameter its own, scalars to log, and what transforms have for statistics afterwards."""
 
 
 class SACLearner:
@@ -48,6 +53,8 @@ class SACLearner:
         behavior (TensorDictModuleBase, optional): the actor with its exploration noise, which
             collects. Default: the actor.
         terms (sequence of Term): further losses. Default: none.
+        transforms (sequence of Transform): what each batch goes through at its update, with all
+            networks as they are by then: a bonus, say. Default: none.
         normalizer (RunningNorm, optional): the networks read
             :data:`~torchrl_etl.learners.NORMALIZED`, which it makes of ``observation``.
         reward (NestedKey): what SAC learns on. Default: ``"reward"``.
@@ -96,6 +103,7 @@ class SACLearner:
         train_decoder: bool = False,
         behavior: TensorDictModuleBase | None = None,
         terms: Sequence[Term] = (),
+        transforms: Sequence[Transform] = (),
         normalizer: RunningNorm | None = None,
         reward: NestedKey = "reward",
         gamma: float = 0.99,
@@ -126,7 +134,9 @@ class SACLearner:
         sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
         scale = make_return_scale(gamma, return_bound)
         units = {"normalizer": normalizer, "return_scale": scale, "reward": reward}
-        self.objective = Objective(sac, actor, terms, **units).to(self.device)
+        self.objective = Objective(sac, actor, terms, **units, transforms=transforms)
+        self.objective.to(self.device)
+        self.statistics = self.objective.statistics
         self.targets = [FusedSoftUpdate(sac, tau=tau)]
         self.targets += [term.target for term in terms if term.target is not None]
         self.ema = WarmedUpEMA(actor, ema_decay)
@@ -137,9 +147,7 @@ class SACLearner:
         normalize_rows(self.unit_rows)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        self._rates = [float(group["lr"]) for group in self.optimizer.param_groups]
-        self._factor = 1.0
-        self._draw = redrawn(self.objective)
+        self._draw = redrawn(self._loss)
         self._step_along(self.gradients)
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
@@ -163,8 +171,10 @@ class SACLearner:
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
         """Critics, actor, temperature and terms take a gradient step; their targets follow."""
-        gradients, scalars = self._gradients(inputs)
+        gradients, scalars, statistics = self._gradients(inputs)
         self.descend(gradients)
+        if statistics:
+            torch._foreach_copy_(list(self.statistics.values()), statistics)
         return scalars
 
     def descend(self, gradients: Sequence[Tensor | None]) -> None:
@@ -174,23 +184,33 @@ class SACLearner:
         for target in self.targets:
             target.step()
 
-    def gradients(self, inputs: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
-        """Gradients of the objective, in the order of ``parameters``, and scalars to log."""
-        loss, scalars = self.loss(inputs)
-        return torch.autograd.grad(loss, self.parameters, allow_unused=True), scalars.detach()
+    def gradients(self, inputs: TensorDictBase) -> Gradients:
+        """Those of the objective, in the order of ``parameters``; nothing is changed."""
+        loss, scalars, statistics = self.loss(inputs)
+        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        return gradients, scalars.detach(), statistics
 
-    def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """The objective, with these random numbers, and scalars to log."""
+    def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
+        """The objective, with these random numbers, scalars to log, and new statistics."""
         draws = inputs["draws"]
         with given_draws(draws[f"{i}"] for i in range(len(draws.keys()))):
-            return self.objective(inputs["batch"])
+            return self._loss(inputs["batch"])
 
-    def update_term(self, term: Term, batch: TensorDictBase) -> TensorDictBase:
-        """One gradient step on a single term, by the same optimizer; returns scalars to log."""
-        loss, scalars = term(batch)
-        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
-        self.optimizer.step_once(gradients)
-        return scalars.detach()
+    def _loss(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
+        statistics = {name: self.objective.get_buffer(name).clone() for name in self.statistics}
+        # As they are shared by modules, not by name, nothing is to be tied.
+        loss, scalars = functional_call(self.objective, statistics, (batch,), tie_weights=False)
+        return loss, scalars, tuple(statistics.values())
+
+    def only(self, *terms: Term) -> SACLearner:
+        """Takes gradient steps on these of its terms alone, by the same optimizer."""
+        twin = copy(self)
+        twin.objective = self.objective.only(*terms)
+        twin.statistics, twin.unit_rows, twin.targets = {}, [], []
+        twin.ema = WarmedUpEMA(nn.Module(), 0.0)
+        twin._draw = redrawn(twin._loss)
+        twin._step_along(twin.gradients)
+        return twin
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take a batch [simulators, time] as it was collected into the running statistics."""
@@ -209,12 +229,7 @@ class SACLearner:
 
     def advance(self, frames: int, progress: float) -> None:
         """Set what depends on the number of frames, and on the share of all frames that it is."""
-        self._factor = 1.0 - (1.0 - self.lr_end) * min(1.0, progress)
-        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
-            if isinstance(group["lr"], Tensor):  # read by a CUDA graph
-                group["lr"].fill_(self._factor * rate)
-            else:
-                group["lr"] = self._factor * rate
+        self.optimizer.scale_rates(1.0 - (1.0 - self.lr_end) * min(1.0, progress))
         for tell in self.on_frames:
             tell(frames)
 
@@ -226,30 +241,32 @@ class SACLearner:
     @property
     def pace(self) -> tuple[float, ...]:
         """How far a step goes now: number of updates, learning rates, rates of targets and EMA."""
-        rates = [self._factor * rate for rate in self._rates]
-        return self.num_updates, *rates, *(target.eps for target in self.targets), self.ema.decay
+        targets = (target.eps for target in self.targets)
+        return self.num_updates, *self.optimizer.rates, *targets, self.ema.decay
 
     @property
     def state(self) -> list[Tensor]:
         """All that an update changes, each tensor once, except the numbers of updates."""
         followers = [tensor for target in self.targets for tensor in target.followers]
         found = *self.parameters, *followers, *self.ema.tensors, *self.optimizer.moments
+        found += tuple(self.statistics.values())
         return list({id(tensor): tensor for tensor in found}.values())
 
     def over(
-        self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Any]
+        self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Gradients]
     ) -> SACLearner:
         """Makes the same updates along other gradients, of other parameters, targets and EMA."""
         twin = copy(self)
         twin.parameters = list(map(other, self.parameters))
         twin.unit_rows = list(map(other, self.unit_rows))
+        twin.statistics = {name: other(each) for name, each in self.statistics.items()}
         twin.optimizer = self.optimizer.over(other)
         twin.targets = [target.over(other) for target in self.targets]
         twin.ema = self.ema.over(other)
         twin._step_along(gradients)
         return twin
 
-    def _step_along(self, gradients: Callable[[TensorDictBase], Any]) -> None:
+    def _step_along(self, gradients: Callable[[TensorDictBase], Gradients]) -> None:
         self._gradients = compiled(gradients) if self.compile else gradients
         graphed = self.compile and self.device.type == "cuda"
         self._step = cuda_graph(self.step) if graphed else self.step

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_etl.learners.sac import SACLearner
+from torchrl_etl.learners.sac import Gradients, SACLearner
 
 __all__ = ["SideBySide"]
 
@@ -27,7 +29,8 @@ class SideBySide:
 
     Raises:
         ValueError: if there is no learner, or one has parameters of other shapes; at an update if
-            learners differ in how many they have had, or in learning rates, tau or EMA decay.
+            learners differ in how many they have had, or in learning rates, tau or EMA decay; at
+            the first one if a transform reads a network that is not known to be its own.
 
     Examples:
         >>> import torch
@@ -61,6 +64,7 @@ class SideBySide:
             )
         self.learners = list(learners)
         self._stacks: dict[int, Tensor] = {}
+        self._checked = not learners[0].objective.transforms
         self._all = learners[0].over(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
@@ -70,25 +74,51 @@ class SideBySide:
             list of TensorDictBase: the scalars [k] of each.
         """
         self._take()
-        scalars = self._all.updates(torch.stack(list(inputs), 1))
+        stacked = torch.stack(list(inputs), 1)
+        if not self._checked:
+            self._check(stacked[0]["batch"])
+            self._checked = True
+        scalars = self._all.updates(stacked)
         self._give_back()
         return list(scalars.unbind(1))
 
-    def gradients(self, inputs: TensorDictBase) -> tuple[tuple[Tensor | None, ...], TensorDictBase]:
-        """Gradients [seeds, ...] in the order of a learner's ``parameters``, and scalars [seeds].
+    def gradients(self, inputs: TensorDictBase) -> Gradients:
+        """As :meth:`SACLearner.gradients` of each, stacked: [seeds, ...].
 
         Args:
             inputs (TensorDictBase): :meth:`SACLearner.inputs` of all, stacked: [seeds].
         """
         first = self.learners[0]
 
-        def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Any, ...]:
             with held.to_module(first.objective, preserve_module_state=False):
                 return first.loss(own)
 
-        losses, scalars = torch.vmap(loss)(self._held(), inputs)
+        losses, scalars, statistics = torch.vmap(loss)(self._held(), inputs)
         gradients = torch.autograd.grad(losses.sum(), self._all.parameters, allow_unused=True)
-        return gradients, scalars.detach()
+        return gradients, scalars.detach(), statistics
+
+    @torch.no_grad()
+    def _check(self, batches: TensorDictBase) -> None:
+        """Refuse transforms that make of every batch what they would with the first's networks."""
+        first = self.learners[0].objective
+
+        def prepare(held: TensorDictBase, batch: TensorDictBase) -> Tensor:
+            with held.to_module(first, preserve_module_state=False):
+                return first.prepare(batch)["next", first.reward]
+
+        with _as_it_was(self._all):
+            together = torch.vmap(prepare)(self._held(), batches)
+        for each, batch, found in zip(self.learners, batches, together, strict=True):
+            with _as_it_was(each):
+                own = each.objective.prepare(batch)["next", first.reward]
+            if (found - own).abs().max() > 0.1 * own.std():
+                names = ", ".join(type(transform).__name__ for transform in first.transforms)
+                raise ValueError(
+                    f"Beside other seeds {names} gives another {first.reward} than alone, so it "
+                    "reads modules that are not known to be its own; give it an attribute "
+                    "networks, a tuple of them."
+                )
 
     def _held(self) -> TensorDictBase:
         """What the learners' objectives hold [seeds]: stacks, or what no update changes, stacked
@@ -134,3 +164,12 @@ class SideBySide:
         rows = zip(*(stack.unbind(0) for stack in self._all.state), strict=True)
         own = (learner.state for learner in self.learners)
         return [row for each in rows for row in each], [tensor for each in own for tensor in each]
+
+
+@contextmanager
+def _as_it_was(learner: SACLearner) -> Iterator[None]:
+    """The statistics of its transforms are not changed."""
+    before = [each.clone() for each in learner.statistics.values()]
+    yield
+    for each, kept in zip(learner.statistics.values(), before, strict=True):
+        each.copy_(kept)

@@ -43,6 +43,6 @@ class EME(Method):
             loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
             with naming("method.options", in_full=True):
                 term = Term(loss, lr=options["lr"], tau=options["tau"])
-            return {"terms": [term], "reward": "total_reward"}
+            return {"terms": [term], "transforms": [bonus], "reward": "total_reward"}
 
-        return self.context.stage(self.context.learner(more=more), transforms=[bonus])
+        return self.context.stage(self.context.learner(more=more))

@@ -179,7 +179,7 @@ class ETL(Method):
         context, explorer = self.context, Explorer(self.context)
         stage = explorer.stage
         yield from context.run_stage(stage, stop)
-        decoder = explorer.condense(stop.check)
+        decoder = yield from explorer.condense(stop.check)
         numbers, warnings = describe_synergies(explorer.model, decoder, explorer.actions())
         if (embedded := explorer.exploration.embed(stage.newest(20_000)["next"])) is not None:
             numbers["direction_alignment"] = direction_alignment(*embedded)

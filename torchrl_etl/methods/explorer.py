@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -12,11 +11,13 @@ from tensordict import TensorDictBase
 
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
-from torchrl_etl.learners import SACLearner, Term
+from torchrl_etl.learners import Term
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
 from torchrl_etl.training.context import Context
+from torchrl_etl.training.stage import AT_ONCE, parts
+from torchrl_etl.training.work import Due, Work
 
 __all__ = ["Explorer", "make_exploration", "make_synergy_model"]
 
@@ -27,8 +28,8 @@ _OTHER_OPTIONS = ("unexpected keyword argument", "required keyword-only argument
 class Explorer:
     """Stage 1: an exploration, a learner that is paid for it, and a synergy model beside it.
 
-    Every update draws one batch. Its bonus is computed as it is drawn, with the representation as
-    it then is; the policy, the representation and the synergy model learn from it side by side.
+    Every update draws one batch. Its bonus is that of the representation as it then is; the policy,
+    the representation and the synergy model learn from it side by side.
 
     Deviates: after the last frame the synergy model is trained on for ``final_updates``; Algorithm
     1 stops with the last frame (0).
@@ -37,6 +38,7 @@ class Explorer:
         exploration (Exploration): see there.
         model (SynergyModel): see there.
         stage (Stage): stage 1.
+        fitter (SACLearner): its learner, for steps on the synergy model alone.
     """
 
     def __init__(self, context: Context) -> None:
@@ -52,8 +54,7 @@ class Explorer:
             )
         self.model = make_synergy_model(context)
         self.relabel = self.exploration.relabel_transforms()
-        transforms = (*self.relabel, *self.exploration.batch_transforms())
-        for transform in transforms:
+        for transform in self.relabel:
             transform.to(context.device)
 
         with naming("exploration"):
@@ -66,54 +67,60 @@ class Explorer:
             if self.model.loss is not None:
                 self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)
                 terms.append(self.term)
-            return {"terms": terms, "reward": self.exploration.reward}
+            return {
+                "terms": terms,
+                "transforms": self.exploration.batch_transforms(),
+                "reward": self.exploration.reward,
+            }
 
         learner = context.learner(
             "explore", inputs=self.exploration.inputs, wrap=self.exploration.behavior, more=more
         )
+        self.fitter = learner.only(*([] if self.term is None else [self.term]))
         env_options = {"activations": True} if fit["actions"] == "activation" else {}
         self.stage = context.stage(
             learner,
             "explore",
             env_options=env_options,
             env_transforms=self.exploration.reset_transforms(),
-            transforms=transforms,
-            **self._updates(learner),
+            transforms=self.relabel,
+            **self._updates(),
             keep=(*self.exploration.keep, *self.shown.keep),
         )
         self.seed = self.stage.seed
 
-    def _updates(self, learner: SACLearner) -> dict[str, Any]:
+    def _updates(self) -> dict[str, Any]:
         """What of the stage's updates is other than its learner's."""
         if self.exploration.learns:
             return {}
         if self.term is None:  # the model is fitted when all actions are known
             return {"learning_starts": sys.maxsize}
-        return {"update": partial(learner.update_term, self.term)}
+        return {"updated": self.fitter}
 
-    def condense(self, on_update: Any = lambda: None) -> SynergyDecoder:
+    def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyDecoder]:
         """Train the synergy model to the end; returns the decoder for stage 2.
 
         Keyword Args:
-            on_update (callable): called before every update; may raise to stop.
+            on_update (callable): called before every few updates; may raise to stop.
         """
         torch.manual_seed(self.seed)  # the same whether or not the run was resumed
         if self.term is None:
             self.model.fit(self.actions(), on_update=on_update)
-        for _ in range(self.final_updates if self.term is not None else 0):
+        due = 0 if self.term is None else self.final_updates
+        for count in parts(due, AT_ONCE[self.stage.device.type]):
             on_update()
-            self.stage.learner.update_term(self.term, self.stage.sample())
+            yield Due("synergies", self.fitter, self.fitter.inputs(self.stage.samples(count)))
         return self.model.decoder(self.actions())
 
     def actions(self, count: int = 20_000) -> torch.Tensor:
         """Up to ``count`` of the latest actions that the synergy model is shown [N, n].
 
-        Rows are relabelled, as in a batch.
+        Rows are relabelled and normalized, as in a batch.
         """
         rows = self.stage.newest(count).to(self.stage.device)
         for transform in self.relabel:
             rows = transform(rows)
-        return self.shown(rows)["action"]
+        return self.shown(self.fitter.objective.prepare(rows))["action"]
 
     def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
         """All that was explored as stage 2 has it: the task's reward, and each executed action with

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,6 +27,7 @@ __all__ = [
     "check_device",
     "of_each_seed",
     "quoted",
+    "to_go_on",
     "validate",
 ]
 
@@ -68,6 +71,8 @@ PRESETS = {
     "faithful": ("null", "default"),
 }
 """Groups of presets, with what stands for none of them, now and before."""
+
+_PLAIN = re.compile(r"[\w.-]*/[\w./-]*")  # and neither a number nor true, false or null
 
 _OF_A_STAGE = ("frames", "batch_size", "replay_ratio", "learning_starts")
 _OF_A_STAGE += ("buffer_size", "buffer_storage")
@@ -176,6 +181,22 @@ def quoted(value: str) -> str:
         'runs/a, (new)'
     """
     return "'" + value.replace("'", "\\'") + "'"
+
+
+def to_go_on(folders: Sequence[Path]) -> str:
+    """The setting that goes on with the runs in these folders; Hydra reads a name that is not
+    plain only between quotation marks.
+
+    Examples:
+        >>> to_go_on([Path("runs/a"), Path("my runs/b")])
+        "resume=[runs/a,'my runs/b']"
+    """
+    names = [str(folder) for folder in folders]
+    if len(names) == 1:
+        return f"resume={names[0]}"
+    return (
+        f"resume=[{','.join(name if _PLAIN.fullmatch(name) else quoted(name) for name in names)}]"
+    )
 
 
 def bfloat16_warning(config: DictConfig) -> str | None:

@@ -28,7 +28,7 @@ from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
 from torchrl_etl.training.work import Due, Work
 
-__all__ = ["Progress", "Stage"]
+__all__ = ["AT_ONCE", "Progress", "Stage", "parts"]
 
 TRANSITION = (
     "observation",
@@ -38,8 +38,8 @@ TRANSITION = (
 
 
 AT_ONCE = {"cpu": 16, "cuda": 64}
-"""Batches that are read from the buffer in one go, where it does nothing more than read them; more
-of them cost a CPU its caches, fewer leave a GPU waiting."""
+"""Batches that are read from the buffer in one go; more cost a CPU its caches, fewer leave a GPU
+waiting."""
 
 
 class Progress:
@@ -84,9 +84,9 @@ class Stage:
         n_steps (int): rewards in a critic's target before it bootstraps, fewer at the end of an
             episode. Intermediate steps get no entropy bonus. Default: 1.
         keep (sequence of NestedKey): further entries of a transition for the buffer.
-        transforms (sequence of Transform): what each sampled batch goes through.
-        update (callable, optional): learns from a batch and returns scalars to log. Default:
-            ``learner.update``.
+        transforms (sequence of Transform): what sampled rows, those of many updates at once, go
+            through; what depends on the updates before it is among the learner's ``transforms``.
+        updated (SACLearner, optional): has the updates. Default: ``learner``.
         prefill_size (int): transitions to make room for beside the budget. Default: 0.
         action_repeat (int): frames that a transition of the collector takes. Default: 1.
         restart_seed (int): another one collects other episodes with the same ``seed``, so that a
@@ -116,7 +116,7 @@ class Stage:
         n_steps: int = 1,
         keep: Sequence[NestedKey] = (),
         transforms: Sequence[Transform] = (),
-        update: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        updated: SACLearner | None = None,
         prefill_size: int = 0,
         action_repeat: int = 1,
         restart_seed: int = 0,
@@ -131,7 +131,7 @@ class Stage:
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
         self.batch_size, self.replay_ratio = batch_size, replay_ratio
         self.learning_starts, self.restart_seed = learning_starts, restart_seed
-        self._update = update
+        self.updated = learner if updated is None else updated
         self.progress = Progress()
         self.batches: Batches | None = None
         acting = {"make_env": make_env, "policy": learner.behavior, "device": device}
@@ -143,8 +143,6 @@ class Stage:
         storage = make_storage(room, device, scratch / name if buffer_storage == "memmap" else None)
         self.buffer = TensorDictReplayBuffer(storage=storage, transform=Compose(*transforms))
         self.transforms = nn.ModuleList(transforms)
-        # What a transform makes of a batch may depend on the updates before it: a bonus does.
-        self._at_once = 1 if transforms else AT_ONCE[device.type]
         self._kept = [*TRANSITION, *keep]
         self.multi_step = None
         if n_steps > 1:
@@ -185,12 +183,9 @@ class Stage:
         self.progress.owed -= due
         self.progress.updates += due
         logs = []
-        for count in parts(due, self._at_once):
-            batches = self.samples(count)
-            if self._update is None:
-                logs.append((yield Due(self.name, self.learner, self.learner.inputs(batches))))
-            else:
-                logs.append(torch.stack([self._update(batch) for batch in batches]))
+        for count in parts(due, AT_ONCE[self.device.type]):
+            inputs = self.updated.inputs(self.samples(count))
+            logs.append((yield Due(self.name, self.updated, inputs)))
         self.learner.advance(self.frames, self.frames / self.budget)
         return torch.cat(logs).mean(0) if logs else None
 
@@ -205,7 +200,7 @@ class Stage:
 
     def update(self) -> TensorDictBase:
         """One update on a sampled batch; returns scalars to log."""
-        return (self._update or self.learner.update)(self.sample())
+        return self.updated.update(self.sample())
 
     def earn(self, transitions: int) -> None:
         """Owe the updates that the frames of so many transitions are worth."""

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_etl.functional import direction_bonus
 from torchrl_etl.transforms.keys import check_network
@@ -123,6 +123,10 @@ class IntrinsicReward(ScaledBonus):
         # Outside the module list: as a submodule the encoder would follow the env's device, be put
         # in eval mode under the learner's feet, and be saved twice.
         self.__dict__["encoder"] = encoder
+
+    @property
+    def networks(self) -> Sequence[nn.Module]:
+        return (self.encoder,)
 
     @property
     def _carried(self) -> Sequence[NestedKey]:

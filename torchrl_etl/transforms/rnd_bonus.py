@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import RNDLoss
 
 from torchrl_etl.transforms.scaled_bonus import ScaledBonus
@@ -81,6 +82,10 @@ class RNDBonus(ScaledBonus):
         self._error = (error,)
 
     @property
+    def networks(self) -> Sequence[nn.Module]:
+        return self._error
+
+    @property
     def _typed_by(self) -> NestedKey:
         return self.in_keys[0]
 
@@ -88,7 +93,7 @@ class RNDBonus(ScaledBonus):
         self, observation: Tensor, next_observation: Tensor, tensordict: TensorDictBase
     ) -> Tensor:
         (error,) = self._error
-        seen = next_observation.to(next(error.parameters()).device)
+        seen = next_observation.to(next(error.parameters(), next_observation).device)
         if error.obs_rms is not None and self.update_statistics:
             error.obs_rms.update(seen)
         rows = TensorDict({"next": {"observation": seen}}, seen.shape[:-1])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from torchrl_etl.transforms.keys import SoleWriter, private_key, set_leaf, set_where_reset
@@ -30,6 +30,11 @@ class TransitionReward(SoleWriter):
 
     _cure: str
     """How to mend that an observation is missing in an environment."""
+
+    @property
+    def networks(self) -> Sequence[nn.Module]:
+        """What it reads and does not hold, since others train and save it."""
+        return ()
 
     @property
     def _carried(self) -> Sequence[NestedKey]:
