@@ -20,7 +20,7 @@ from tests.point_env import PointTask
 from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import Batches, CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
-from torchrl_etl.learners.sac import episode_numbers
+from torchrl_etl.learners.parts import episode_numbers
 from torchrl_etl.modules import make_actor
 
 FRAMES = 48

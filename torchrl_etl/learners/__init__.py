@@ -3,7 +3,8 @@
 from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
-from torchrl_etl.learners.sac import SACLearner, entropy_target, from_observation
+from torchrl_etl.learners.parts import entropy_target, from_observation
+from torchrl_etl.learners.sac import SACLearner
 from torchrl_etl.learners.side_by_side import SideBySide
 from torchrl_etl.learners.term import Term
 

@@ -15,7 +15,8 @@ from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_choice, check_flag, naming
 from torchrl_etl.learners.objective import NORMALIZED
-from torchrl_etl.learners.sac import SACLearner, entropy_target
+from torchrl_etl.learners.parts import entropy_target
+from torchrl_etl.learners.sac import SACLearner
 from torchrl_etl.modules import (
     HeldNoise,
     RunningNorm,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, Literal, TypeAlias
 
@@ -13,7 +12,6 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictModuleBase,
-    TensorDictSequential,
 )
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -21,17 +19,26 @@ from torch.func import functional_call
 from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_flag, check_integer, check_real, renaming
+from torchrl_etl.checks import check_flag
 from torchrl_etl.draws import given_draws, redrawn
-from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
-from torchrl_etl.learners.objective import NORMALIZED, Objective
+from torchrl_etl.learners.objective import Objective
+from torchrl_etl.learners.parts import (
+    check_rates,
+    episode_numbers,
+    from_observation,
+    linear_weights,
+    make_loss,
+    make_optimizer,
+    make_return_scale,
+    parameter_groups,
+)
 from torchrl_etl.learners.term import Term
-from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap, normalize_rows
-from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss, SynergySACLoss
+from torchrl_etl.modules import RunningNorm, SynergyMap, normalize_rows
+from torchrl_etl.objectives import FusedSoftUpdate
 
-__all__ = ["Gradients", "SACLearner", "entropy_target", "from_observation"]
+__all__ = ["Gradients", "SACLearner"]
 
 Gradients: TypeAlias = tuple[tuple[Tensor | None, ...], TensorDictBase, tuple[Tensor, ...]]
 """Of each parameter its own, scalars to log, and what transforms have for statistics afterwards."""
@@ -280,132 +287,3 @@ class SACLearner:
             "ema": self.ema,
             "optimizer": self.optimizer,
         }
-
-
-def check_rates(lr: float, lr_end: float, tau: float, ema_decay: float) -> None:
-    """Refuse what no learning rate and no EMA can be."""
-    check_real("(0, inf)", lr=lr)
-    check_real("[0, 1]", lr_end=lr_end)
-    check_real("(0, 1]", tau=tau)
-    check_real("[0, 1)", ema_decay=ema_decay)
-
-
-def make_loss(
-    actor: ProbabilisticTensorDictSequential,
-    critic: TensorDictModule,
-    gamma: float,
-    return_bound: float | None,
-    *,
-    decoder: SynergyMap | None,
-    train_decoder: bool,
-    alpha_init: float,
-    num_critics: int,
-    bins: int,
-    **options: Any,
-) -> LeanSACLoss:
-    """SAC's losses, of actions or of the synergies that a decoder turns into actions."""
-    check_real("[0, 1)", gamma=gamma)
-    check_real("(0, inf)", alpha_init=alpha_init)
-    check_integer(1, num_critics=num_critics, bins=bins)
-    options |= {"alpha_init": alpha_init, "num_qvalue_nets": num_critics}
-    options["support"] = support(bins, return_bound)
-    if decoder is None:
-        sac = LeanSACLoss(actor, critic, **options)
-    else:
-        sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
-    sac.make_value_estimator(gamma=gamma)
-    _ = sac.target_entropy  # created lazily; it must exist before the optimizer does
-    return sac
-
-
-def make_return_scale(gamma: float, return_bound: float | None) -> ReturnScale | None:
-    """What divides the reward so that returns stay within the bound, if there is one."""
-    if return_bound is None:
-        return None
-    with renaming(bound="return_bound"):
-        return ReturnScale(gamma, bound=return_bound)
-
-
-def from_observation(
-    actor: TensorDictModuleBase, normalizer: RunningNorm | None, decoder: SynergyMap | None
-) -> TensorDictModuleBase:
-    """An actor as it acts in an environment: on raw observations, with decoded actions."""
-    before, after = [], [] if decoder is None else [decoder]
-    if normalizer is not None:
-        before = [TensorDictModule(normalizer, ["observation"], [NORMALIZED])]
-    return TensorDictSequential(*before, actor, *after) if before or after else actor
-
-
-def entropy_target(action_spec: Bounded, action_std: float | None) -> float:
-    """Entropy of a Gaussian with ``action_std`` per dimension, in units where the bounds are ±1.
-
-    ``None`` gives SAC's usual minus the number of dimensions.
-
-    Examples:
-        >>> from torchrl.data import Bounded
-        >>> round(entropy_target(Bounded(-1, 1, shape=(2,)), action_std=1.0), 3)  # ln(2πe)
-        2.838
-        >>> round(entropy_target(Bounded(0, 1, shape=(2,)), action_std=1.0), 3)  # half as wide
-        1.452
-    """
-    if action_std is None:
-        return -float(action_spec.shape.numel())
-    check_real("(0, inf)", action_std=action_std)
-    half_range = (action_spec.space.high - action_spec.space.low) / 2
-    return float((half_range * action_std * math.sqrt(2 * math.pi * math.e)).log().sum())
-
-
-def support(bins: int, bound: float | None) -> Tensor | None:
-    """Where categorical critics put the return; ``None`` for critics of one output.
-
-    Examples:
-        >>> support(3, 5.0)
-        tensor([-5.,  0.,  5.])
-    """
-    if bins == 1:
-        return None
-    if bound is None:
-        raise ValueError(
-            f"return_bound is null but critics have {bins} bins; categorical critics need a bound "
-            "on returns, such as return_bound=5."
-        )
-    return torch.linspace(-bound, bound, bins)
-
-
-def episode_numbers(batch: TensorDictBase) -> Tensor:
-    """A number for the episode of each transition [*].
-
-    Workers of one machine number theirs together, those on other machines each on their own.
-    """
-    number = batch["collector", "traj_ids"]
-    worker = batch.get(("collector", "worker"), None)
-    return number if worker is None else number + (worker << 32)
-
-
-def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
-    """Weights of the linear layers of actor [out, in] and stacked critics [critics, out, in]."""
-    for params, ndim in ((sac.actor_network_params, 2), (sac.qvalue_network_params, 3)):
-        yield from (p for p in params.parameters() if p.ndim == ndim)
-
-
-def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
-    """What is trained, each parameter once: a term's own at its learning rate, then SAC's."""
-    groups, known = [], set()
-    of_terms = ((term.loss, lr if term.lr is None else term.lr) for term in terms)
-    for module, rate in (*of_terms, (sac, lr)):
-        fresh = [p for p in module.parameters() if p.requires_grad and id(p) not in known]
-        known |= {id(parameter) for parameter in fresh}
-        if fresh:
-            groups.append({"params": fresh, "lr": rate})
-    return groups
-
-
-def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> GradientAdam:
-    """Adam that takes all steps in one operation, which a CUDA graph can hold.
-
-    It reads learning rates from tensors there, so that they can change.
-    """
-    graphed = device.type == "cuda"
-    if graphed:
-        groups = [{**group, "lr": torch.tensor(group["lr"], device=device)} for group in groups]
-    return GradientAdam(list(groups), fused=True, capturable=graphed)
