@@ -91,7 +91,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
             torch.testing.assert_close(scalars[key], alone[key])
     for one, other in zip(*twins, strict=True):
         ours, theirs = (found.stage.learner.statistics for found in (one, other))
-        assert ours["transforms.0.deviation.weight"] > 0 and ours["networks.0.obs_rms.count"] > 1
+        assert ours["transforms.0.deviation.weight"] > 0 and ours["terms.0.loss.obs_rms.count"] > 1
         for name, value in theirs.items():
             torch.testing.assert_close(ours[name], value)
 

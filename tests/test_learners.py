@@ -6,12 +6,17 @@ from copy import deepcopy
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torchrl.data import Bounded
+from torchrl.envs.transforms import Transform
 
 from tests.stages import fill, learn_stage
-from torchrl_etl.learners import WarmedUpEMA
+from torchrl_etl.learners import SACLearner, Term, WarmedUpEMA
 from torchrl_etl.learners.adam import GradientAdam
+from torchrl_etl.modules import StateEncoder, make_actor, make_critic
+from torchrl_etl.objectives import BehavioralMetricLoss
 
 RATES = (0.1, 0.03)
 
@@ -28,13 +33,15 @@ def groups(weights):
     ]
 
 
-@pytest.mark.parametrize("unused", [None, 1])
+@pytest.mark.parametrize(
+    "unused", [lambda step: None, lambda step: 1, lambda step: step % 3], ids=["none", "1", "turns"]
+)
 def test_a_step_along_gradients_is_adams_step(unused):
     ours, theirs = parameters(), parameters()
     optimizer = GradientAdam(groups(ours), fused=True)
     reference = Adam(groups(theirs), fused=True)
     for step in range(6):
-        gradients = [None if i == unused else torch.randn(3) for i in range(3)]
+        gradients = [None if i == unused(step) else torch.randn(3) for i in range(3)]
         if step == 3:  # a learning rate falls, and a checkpoint is loaded
             optimizer.param_groups[0]["lr"] = reference.param_groups[0]["lr"] = 0.02
             optimizer.load_state_dict(deepcopy(optimizer.state_dict()))
@@ -43,7 +50,7 @@ def test_a_step_along_gradients_is_adams_step(unused):
             parameter.grad = gradient
         reference.step()
         assert all((a == b).all() for a, b in zip(ours, theirs, strict=True))
-    assert unused is None or (ours[unused] == parameters()[unused]).all()
+    assert unused(0) != 1 or (ours[1] == parameters()[1]).all()
 
 
 def test_a_gradient_and_a_loaded_moment_lie_as_the_parameter_does():
@@ -109,3 +116,35 @@ def test_updates_on_several_batches_are_those_on_each_in_turn():
     ours, theirs = (stage.learner.objective.state_dict() for stage in (at_once, in_turn))
     assert all((value == theirs[key]).all() for key, value in ours.items())
     at_once.close(), in_turn.close()
+
+
+class Measures(Transform):
+    """Pays by an encoder whose loss has targets."""
+
+    def __init__(self, loss):
+        super().__init__()
+        self.networks = (loss,)
+
+    def forward(self, batch):
+        paid = self.networks[0].encoder_params["module", "0", "weight"].sum()
+        return batch.set(("next", "reward"), paid.expand(*batch.shape, 1))
+
+
+def test_targets_that_a_transform_reads_follow_all_the_same():
+    spec = Bounded(-1, 1, shape=(2,))
+    loss = BehavioralMetricLoss(StateEncoder(3, 2, hidden=(8,)))
+    learner = SACLearner(
+        make_actor({"observation": 3}, spec),
+        make_critic({"observation": 3, "action": 2}),
+        action_spec=spec,
+        terms=[Term(loss, tau=0.5)],
+        transforms=[Measures(loss)],
+    )
+    assert not any("target" in name for name in learner.statistics)
+    before = loss.target_encoder_params.clone()
+    end = torch.zeros(32, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(32, 3), "reward": torch.randn(32, 1)}
+    following |= {"done": end, "terminated": end}
+    entries = {"observation": torch.randn(32, 3), "action": torch.zeros(32, 2)}
+    learner.update(TensorDict({**entries, "next": following}, [32]))
+    assert (loss.target_encoder_params != before).any()

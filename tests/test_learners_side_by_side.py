@@ -11,6 +11,7 @@ from torchrl.envs.transforms import Transform
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
+from torchrl_etl.draws import standard_normal
 from torchrl_etl.learners import SACLearner, SideBySide
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
@@ -131,7 +132,8 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
     learners = [stage.updated for stage in stages]
     read = torch.cat(inputs(learners, batches))
     with torch.no_grad():  # each its own, also of what is no network
-        stages[1].updated.objective.sac.log_alpha += 1
+        if (sac := stages[1].updated.objective.sac) is not None:
+            sac.log_alpha += 1
         if (normalizer := stages[1].updated.objective.normalizer) is not None:
             normalizer.mean += 1
     group = taken(learners)
@@ -171,35 +173,84 @@ def test_finding_out_what_is_drawn_draws_nothing():
     stage.close()
 
 
-class Secretive(Transform):
-    """Pays by a network that nobody is told of."""
+class Pays(Transform):
+    """Something of a network's, and random numbers; it counts its calls."""
 
-    def __init__(self, network):
+    def __init__(self, network, noise=1.0):
         super().__init__()
-        self.pay = network.forward  # no submodule
+        self.pay, self.noise = network.forward, noise  # no submodule
+        self.register_buffer("calls", torch.zeros(()))
 
     def forward(self, batch):
-        return batch.set(("next", "reward"), self.pay(batch["observation"]).detach())
+        paid = self.pay(batch["observation"])
+        self.calls.add_(1 + 0 * paid.sum())
+        return batch.set(("next", "reward"), paid + self.noise * standard_normal(paid))
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_a_transform_that_reads_another_seeds_network_is_refused(told):
+def paid_learners(make_transform):
+    """Two learners with a transform each, and what they read."""
     learners, spec = [], Bounded(-1, 1, shape=(2,))
     for _ in SEEDS:
-        transform = Secretive(network := torch.nn.Linear(3, 1))
-        if told:
-            transform.networks = (network,)
         actor = make_actor({"observation": 3}, spec)
         critic = make_critic({"observation": 3, "action": 2})
-        learners.append(SACLearner(actor, critic, action_spec=spec, transforms=[transform]))
-    end = torch.zeros(1, 32, 1, dtype=torch.bool)
-    following = {"observation": torch.randn(1, 32, 3), "done": end, "terminated": end}
-    entries = {"observation": torch.randn(1, 32, 3), "action": torch.zeros(1, 32, 2)}
-    batches = TensorDict({**entries, "next": following}, [1, 32])
-    inputs = [learner.inputs(batches) for learner in learners]
-    if told:
-        return SideBySide(learners).updates(inputs)
-    with pytest.raises(ValueError, match="Secretive gives another reward than alone"):
+        transforms = [make_transform()]
+        learners.append(SACLearner(actor, critic, action_spec=spec, transforms=transforms))
+    end = torch.zeros(2, 32, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(2, 32, 3), "done": end, "terminated": end}
+    entries = {"observation": torch.randn(2, 32, 3), "action": torch.zeros(2, 32, 2)}
+    batches = TensorDict({**entries, "next": following}, [2, 32])
+    return learners, [learner.inputs(batches) for learner in learners]
+
+
+def told_of(network, **options):
+    transform = Pays(network, **options)
+    transform.networks = (network,)
+    return transform
+
+
+def test_a_transform_has_its_own_network_random_numbers_and_statistics_beside_others():
+    learners, inputs = paid_learners(lambda: told_of(torch.nn.Linear(3, 1)))
+    alone = [
+        learner.loss(own[0])[1]["loss_qvalue"]
+        for learner, own in zip(learners, inputs, strict=True)
+    ]
+    together = SideBySide(learners).updates(inputs)
+    for learner, scalars, expected in zip(learners, together, alone, strict=True):
+        torch.testing.assert_close(scalars["loss_qvalue"][0], expected.detach())
+        (calls,) = learner.statistics.values()
+        assert calls == 2 and not calls.requires_grad
+
+
+def test_a_transform_that_reads_a_network_of_another_seed_is_refused():
+    learners, inputs = paid_learners(lambda: Pays(torch.nn.Linear(3, 1)))
+    with pytest.raises(ValueError, match="Pays gives another reward than alone"):
+        SideBySide(learners).updates(inputs)
+
+
+def test_a_reward_that_is_the_same_everywhere_is_no_fault():
+    def make():
+        network = torch.nn.Linear(3, 1)
+        torch.nn.init.zeros_(network.weight)
+        return told_of(network, noise=0.0)
+
+    learners, inputs = paid_learners(make)
+    SideBySide(learners).updates(inputs)
+
+
+def test_learners_whose_synergy_models_differ_in_their_updates_are_refused():
+    """As runs that were resumed may: the numbers are in the optimizer, which is saved."""
+    fitters = []
+    for seed, updates in zip(SEEDS, (1, 2), strict=True):
+        found = explorer("exploration=noise", f"seed={seed}")
+        fill(found.stage)
+        found.fitter.updates(found.fitter.inputs(found.stage.samples(updates)))
+        again = explorer("exploration=noise", f"seed={seed}")
+        again.stage.learner.optimizer.load_state_dict(found.stage.learner.optimizer.state_dict())
+        fitters.append((again.fitter, again.fitter.inputs(found.stage.samples(1))))
+        found.stage.close(), again.stage.close()
+    learners, inputs = zip(*fitters, strict=True)
+    assert [learner.num_updates for learner in learners] == [1, 2]
+    with pytest.raises(ValueError, match="updates and rates differ"):
         SideBySide(learners).updates(inputs)
 
 

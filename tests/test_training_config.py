@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +19,8 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
-from torchrl_etl.training.config import RENAMED, of_each_seed
+from torchrl_etl.training.config import RENAMED, of_each_seed, quoted, to_go_on
+from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.training.run_folder import RunFolder
 
 GROUPS = {
@@ -350,3 +352,13 @@ def test_seeds_that_would_share_a_folder_have_one_each_below_it():
 def test_seeds_that_are_no_list_of_different_seeds_are_one_sentence(seeds):
     with pytest.raises(ValueError, match=r"seeds is .*; it must be a list of different whole"):
         of_each_seed(tiny(f"seeds={seeds}", "run_dir=runs/a"))
+
+
+FOLDERS = ("runs/a", "my runs/b", "läufe/c", "it's/d", "a,b/e", "1", "null", "g/\\", "h/\\'")
+
+
+def test_hydra_reads_the_names_of_folders_as_they_are():
+    for folder in FOLDERS:
+        assert parse_override(f"run_dir={quoted(folder)}").value() == folder
+    found = parse_override(to_go_on([Path(folder) for folder in FOLDERS])).value()
+    assert [str(each) for each in found] == list(FOLDERS)

@@ -23,9 +23,9 @@ __all__ = ["EMEBonus"]
 class EMEBonus(TransitionReward):
     """Rewards steps that are long in EME's metric, more so where the reward is not yet known.
 
-    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer,
-    where every *sampled* batch gets the bonus of the networks as they are by then, and on a
-    tensordict, and holds both networks by reference: they belong to whoever trains them
+    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer or in
+    a learner, where every *sampled* batch gets the bonus of the networks as they are by then, and
+    on a tensordict, and holds both networks by reference: they belong to whoever trains them
     (:class:`~torchrl_etl.baselines.eme.EMELoss`).
 
     Equation: ``b = d(s, s') min(max(Var_k r̂_k(s, a), 1), M)``, and ``r + weight b`` for the

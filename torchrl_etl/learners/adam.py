@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -31,16 +31,18 @@ class GradientAdam(Adam):
         tensor([0.8000], requires_grad=True)
     """
 
+    factor = 1.0
+
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.factor = 1.0
-        self._rates = [float(group["lr"]) for group in self.param_groups]
+        for group in self.param_groups:
+            group.setdefault("initial_lr", float(group["lr"]))
         self._begin()
 
     @property
     def rates(self) -> list[float]:
-        """The learning rates of now, without asking a GPU."""
-        return [self.factor * rate for rate in self._rates]
+        """The learning rates that :meth:`scale_rates` set, without asking a GPU."""
+        return [self.factor * group["initial_lr"] for group in self.param_groups]
 
     def scale_rates(self, factor: float) -> None:
         """Set all learning rates to a share of those that they began with."""
@@ -61,6 +63,11 @@ class GradientAdam(Adam):
         """The number of steps that each parameter has had."""
         return [state["step"] for state in self._states]
 
+    def steps_of(self, parameters: Iterable[Tensor]) -> int:
+        """The most steps that one of these parameters has had."""
+        steps = [self.state[each]["step"] for each in parameters if each in self.state]
+        return int(torch.stack(steps).max()) if steps else 0
+
     def over(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
         """The same for other parameters than these, before its first step."""
         groups = [
@@ -70,12 +77,14 @@ class GradientAdam(Adam):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take the state of another one, perhaps of another device."""
-        own = [(group["lr"], group["capturable"]) for group in self.param_groups]
+        kept = ("lr", "initial_lr", "capturable")
+        own = [{key: group[key] for key in kept} for group in self.param_groups]
         super().load_state_dict(state_dict)
-        for group, (lr, capturable) in zip(self.param_groups, own, strict=True):
-            loaded = float(group["lr"])  # a CUDA graph reads a tensor, and that same tensor
+        for group, before in zip(self.param_groups, own, strict=True):
+            loaded, lr = float(group["lr"]), before["lr"]
+            group |= before
+            # A CUDA graph reads a tensor, and that same tensor.
             group["lr"] = lr.fill_(loaded) if isinstance(lr, Tensor) else loaded
-            group["capturable"] = capturable
         for parameter, state in self.state.items():
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = _laid_out(state[moment], parameter)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -21,7 +22,7 @@ NORMALIZED = "normalized_observation"
 
 
 class Objective(nn.Module):
-    """A function of parameters and a batch, which changes nothing but :attr:`statistics`.
+    """A function of parameters and a batch; calling it changes nothing but :attr:`statistics`.
 
     Args:
         sac (LeanSACLoss, optional): the losses of actor, critics and temperature.
@@ -32,8 +33,9 @@ class Objective(nn.Module):
         normalizer (RunningNorm, optional): scales the observations that actor and critics read.
         return_scale (ReturnScale, optional): scales the reward that SAC learns on.
         reward (NestedKey): that reward, below ``"next"``. Default: ``"reward"``.
-        transforms (sequence of Transform): what each batch goes through first, with all networks
-            as they are by then; those that they read and do not hold are their ``networks``.
+        transforms (sequence of Transform): what each batch goes through first, without gradients
+            and with all networks as they are by then; those that they read and do not hold are
+            their ``networks``.
     """
 
     def __init__(
@@ -51,8 +53,8 @@ class Objective(nn.Module):
         self.sac, self.actor, self.terms = sac, actor, nn.ModuleList(terms)
         self.normalizer, self.return_scale, self.reward = normalizer, return_scale, reward
         self.transforms = nn.ModuleList(transforms)
-        read = (network for each in transforms for network in getattr(each, "networks", ()))
-        self.networks = nn.ModuleList(read)
+        # In a tuple they are no part of it: whoever trains them saves them.
+        self.networks = tuple(own for each in transforms for own in getattr(each, "networks", ()))
         if sac is not None:
             sac.set_keys(reward=reward)
 
@@ -78,14 +80,21 @@ class Objective(nn.Module):
     @property
     def statistics(self) -> dict[str, Tensor]:
         """What transforms may change, by their names in this module: buffers, as running means."""
-        changing = nn.ModuleDict({"transforms": self.transforms, "networks": self.networks})
-        return dict(changing.named_buffers())
+        changing = {id(own) for own in nn.ModuleList([*self.transforms, *self.networks]).buffers()}
+        return {
+            name: own
+            for prefix, module in self.named_modules()
+            if not isinstance(module, TensorDictParams)  # targets of a loss, which follow
+            for name, own in module.named_buffers(prefix, recurse=False)
+            if id(own) in changing
+        }
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """The batch as transforms make it, observations and reward in units of those so far."""
         batch = batch.copy()
-        for transform in self.transforms:
-            batch = transform(batch)
+        with torch.no_grad():
+            for transform in self.transforms:
+                batch = transform(batch)
         if self.normalizer is not None:
             for end in (batch, batch["next"]):
                 end[NORMALIZED] = self.normalizer(end["observation"])

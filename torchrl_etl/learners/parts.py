@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_integer, check_real, renaming
+from torchrl_etl.draws import given_draws
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.objective import NORMALIZED
 from torchrl_etl.learners.term import Term
@@ -26,6 +28,7 @@ from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
 
 __all__ = [
     "check_rates",
+    "drawn_in",
     "entropy_target",
     "episode_numbers",
     "from_observation",
@@ -125,6 +128,12 @@ def support(bins: int, bound: float | None) -> Tensor | None:
             "on returns, such as return_bound=5."
         )
     return torch.linspace(-bound, bound, bins)
+
+
+def drawn_in(inputs: TensorDictBase) -> AbstractContextManager[None]:
+    """Losses take the random numbers of these inputs of an update."""
+    draws = inputs["draws"]
+    return given_draws(draws[f"{i}"] for i in range(len(draws.keys())))
 
 
 def episode_numbers(batch: TensorDictBase) -> Tensor:

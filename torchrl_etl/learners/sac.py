@@ -20,12 +20,13 @@ from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_flag
-from torchrl_etl.draws import given_draws, redrawn
+from torchrl_etl.draws import redrawn
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import Objective
 from torchrl_etl.learners.parts import (
     check_rates,
+    drawn_in,
     episode_numbers,
     from_observation,
     linear_weights,
@@ -154,6 +155,7 @@ class SACLearner:
         normalize_rows(self.unit_rows)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        self._counted = list(actor.parameters())
         self._draw = redrawn(self._loss)
         self._step_along(self.gradients)
 
@@ -199,13 +201,12 @@ class SACLearner:
 
     def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
         """The objective, with these random numbers, scalars to log, and new statistics."""
-        draws = inputs["draws"]
-        with given_draws(draws[f"{i}"] for i in range(len(draws.keys()))):
+        with drawn_in(inputs):
             return self._loss(inputs["batch"])
 
     def _loss(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
         statistics = {name: self.objective.get_buffer(name).clone() for name in self.statistics}
-        # As they are shared by modules, not by name, nothing is to be tied.
+        # One module of two names would be left with the copies if those were tied.
         loss, scalars = functional_call(self.objective, statistics, (batch,), tie_weights=False)
         return loss, scalars, tuple(statistics.values())
 
@@ -215,6 +216,7 @@ class SACLearner:
         twin.objective = self.objective.only(*terms)
         twin.statistics, twin.unit_rows, twin.targets = {}, [], []
         twin.ema = WarmedUpEMA(nn.Module(), 0.0)
+        twin._counted = list(twin.objective.terms.parameters())
         twin._draw = redrawn(twin._loss)
         twin._step_along(twin.gradients)
         return twin
@@ -242,8 +244,8 @@ class SACLearner:
 
     @property
     def num_updates(self) -> int:
-        """Updates up to now, each with a step of the EMA."""
-        return int(self.ema.n_averaged)
+        """Updates up to now, as the optimizer has counted them."""
+        return self.optimizer.steps_of(self._counted)
 
     @property
     def pace(self) -> tuple[float, ...]:

@@ -10,6 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_etl.learners.objective import Objective
+from torchrl_etl.learners.parts import drawn_in
 from torchrl_etl.learners.sac import Gradients, SACLearner
 
 __all__ = ["SideBySide"]
@@ -64,6 +66,7 @@ class SideBySide:
             )
         self.learners = list(learners)
         self._stacks: dict[int, Tensor] = {}
+        self._whole = whole(learners[0].objective)
         self._checked = not learners[0].objective.transforms
         self._all = learners[0].over(self._stack, self.gradients)
 
@@ -76,7 +79,7 @@ class SideBySide:
         self._take()
         stacked = torch.stack(list(inputs), 1)
         if not self._checked:
-            self._check(stacked[0]["batch"])
+            self._check(stacked[0])
             self._checked = True
         scalars = self._all.updates(stacked)
         self._give_back()
@@ -91,7 +94,7 @@ class SideBySide:
         first = self.learners[0]
 
         def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Any, ...]:
-            with held.to_module(first.objective, preserve_module_state=False):
+            with held.to_module(self._whole, preserve_module_state=False):
                 return first.loss(own)
 
         losses, scalars, statistics = torch.vmap(loss)(self._held(), inputs)
@@ -99,20 +102,24 @@ class SideBySide:
         return gradients, scalars.detach(), statistics
 
     @torch.no_grad()
-    def _check(self, batches: TensorDictBase) -> None:
+    def _check(self, inputs: TensorDictBase) -> None:
         """Refuse transforms that make of every batch what they would with the first's networks."""
         first = self.learners[0].objective
 
-        def prepare(held: TensorDictBase, batch: TensorDictBase) -> Tensor:
-            with held.to_module(first, preserve_module_state=False):
-                return first.prepare(batch)["next", first.reward]
+        def reward(objective: Objective, own: TensorDictBase) -> Tensor:
+            with drawn_in(own):
+                return objective.prepare(own["batch"])["next", objective.reward]
+
+        def of_the_first(held: TensorDictBase, own: TensorDictBase) -> Tensor:
+            with held.to_module(self._whole, preserve_module_state=False):
+                return reward(first, own)
 
         with _as_it_was(self._all):
-            together = torch.vmap(prepare)(self._held(), batches)
-        for each, batch, found in zip(self.learners, batches, together, strict=True):
+            together = torch.vmap(of_the_first)(self._held(), inputs)
+        for each, own, found in zip(self.learners, inputs, together, strict=True):
             with _as_it_was(each):
-                own = each.objective.prepare(batch)["next", first.reward]
-            if (found - own).abs().max() > 0.1 * own.std():
+                alone = reward(each.objective, own)
+            if not (found - alone).abs().max() <= 0.1 * alone.std() + 1e-3 * alone.abs().max():
                 names = ", ".join(type(transform).__name__ for transform in first.transforms)
                 raise ValueError(
                     f"Beside other seeds {names} gives another {first.reward} than alone, so it "
@@ -121,14 +128,14 @@ class SideBySide:
                 )
 
     def _held(self) -> TensorDictBase:
-        """What the learners' objectives hold [seeds]: stacks, or what no update changes, stacked
-        anew."""
+        """What the learners' objectives hold or read [seeds]: stacks, or what no update changes,
+        stacked anew."""
 
         def stacked(*own: Tensor) -> Tensor:
             found = self._stacks.get(id(own[0]))
             return torch.stack(own) if found is None else found
 
-        held, *others = (TensorDict.from_module(each.objective) for each in self.learners)
+        held, *others = (TensorDict.from_module(whole(each.objective)) for each in self.learners)
         return held.apply(stacked, *others, batch_size=[len(self.learners)])
 
     def _stack(self, own: Tensor) -> Tensor:
@@ -164,6 +171,11 @@ class SideBySide:
         rows = zip(*(stack.unbind(0) for stack in self._all.state), strict=True)
         own = (learner.state for learner in self.learners)
         return [row for each in rows for row in each], [tensor for each in own for tensor in each]
+
+
+def whole(objective: Objective) -> nn.Module:
+    """An objective, and what its transforms read."""
+    return nn.ModuleList([objective, *objective.networks])
 
 
 @contextmanager

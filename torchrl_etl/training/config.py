@@ -72,7 +72,7 @@ PRESETS = {
 }
 """Groups of presets, with what stands for none of them, now and before."""
 
-_PLAIN = re.compile(r"[\w.-]*/[\w./-]*")  # and neither a number nor true, false or null
+_PLAIN = re.compile(r"[\w.-]*/[\w./-]*", re.ASCII)  # and no number, true, false or null
 
 _OF_A_STAGE = ("frames", "batch_size", "replay_ratio", "learning_starts")
 _OF_A_STAGE += ("buffer_size", "buffer_storage")
@@ -180,7 +180,9 @@ def quoted(value: str) -> str:
         >>> parse_override(f"run_dir={quoted('runs/a, (new)')}").value()
         'runs/a, (new)'
     """
-    return "'" + value.replace("'", "\\'") + "'"
+    # Backslashes stand for themselves but before a quotation mark.
+    value = re.sub(r"(\\*)'", r"\1\1\\'", value)
+    return "'" + re.sub(r"(\\+)$", r"\1\1", value) + "'"
 
 
 def to_go_on(folders: Sequence[Path]) -> str:

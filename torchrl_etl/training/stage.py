@@ -259,7 +259,7 @@ class Stage:
     def checkpoint(self) -> Checkpoint:
         """Everything the stage needs to go on, as a TorchRL checkpoint."""
         parts = {**self.learner.parts, "progress": self.progress, "rng": GlobalRNGState()}
-        parts["transforms"] = self.transforms  # running statistics of a bonus, say
+        parts["transforms"] = self.transforms
         return Checkpoint(**parts).register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:

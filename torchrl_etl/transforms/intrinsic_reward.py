@@ -22,13 +22,15 @@ __all__ = ["IntrinsicReward"]
 class IntrinsicReward(ScaledBonus):
     """Rewards movement of the state embedding along the direction of the episode.
 
-    The same class works in three places:
+    The same class works in four places:
 
     - on an env: every step writes the bonus, for logging or on-policy learners. The env's state
       spec then holds the direction and a private copy of the observation, so that the bonus is
       that of the observations which this transform sees, whatever later transforms make of them;
     - on a replay buffer: every *sampled* batch gets the bonus of the current encoder, so that the
       reward is never stale. Nothing is written when the buffer is extended;
+    - among the transforms of a :class:`~torchrl_etl.learners.SACLearner`: the same, inside of the
+      compiled update;
     - called on a tensordict with root and ``"next"`` entries, any batch size, time included.
 
     In a group of agents each has a bonus of its own; a direction outside of the group is that of

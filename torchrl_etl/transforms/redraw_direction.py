@@ -21,8 +21,8 @@ class RedrawDirection(Transform):
     goals. A few thousand frames hold some dozens of directions, and every transition is then worth
     one for all of them.
 
-    Goes on a replay buffer before :class:`IntrinsicReward`, or is called on a tensordict of
-    transitions, of any batch size. What the buffer holds is not changed.
+    Goes on a replay buffer, before :class:`IntrinsicReward` if that is there too, or is called on a
+    tensordict of transitions, of any batch size. What the buffer holds is not changed.
 
     Deviates: Algorithm 1 learns from the direction that was followed; ``share=0`` is the print.
 

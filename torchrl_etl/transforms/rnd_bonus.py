@@ -18,9 +18,9 @@ __all__ = ["RNDBonus"]
 class RNDBonus(ScaledBonus):
     """Rewards observations whose random features are not yet predicted (RND, Burda 2018).
 
-    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer,
-    where every *sampled* batch gets the error of the predictor as it is by then, and on a
-    tensordict. The error is that of TorchRL's loss, whose networks and statistics are held by
+    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer or in
+    a learner, where every *sampled* batch gets the error of the predictor as it is by then, and on
+    a tensordict. The error is that of TorchRL's loss, whose networks and statistics are held by
     reference; they belong to whoever trains and saves the loss. A call takes the observations that
     it sees into the loss's statistics first. TorchRL's own ``RNDTransform`` is for environments
     alone, see ``docs/torchrl_notes.md``.

@@ -35,8 +35,9 @@ class ScaledBonus(TransitionReward):
         reward_key (NestedKey): the task's reward, read where ``extrinsic_weight`` is not 0.
             Default: ``"reward"``.
         update_statistics (bool): whether calls update the running statistics; an attribute of the
-            same name can be set at any time. It does not depend on train and eval mode, since
-            TorchRL puts transforms of envs and buffers in eval mode. Default: ``True``.
+            same name can be set at any time, in a compiled learner before its first update. It does
+            not depend on train and eval mode, since TorchRL puts transforms of envs and buffers in
+            eval mode. Default: ``True``.
 
     Raises:
         ValueError: if ``decay`` is used and outside (0, 1), or ``extrinsic_weight`` is negative.
