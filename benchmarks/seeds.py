@@ -2,13 +2,13 @@
 
     python benchmarks/seeds.py
     python benchmarks/seeds.py --seeds 8 --compile
-    python benchmarks/seeds.py --seeds 16 --compile --device cuda
+    python benchmarks/seeds.py --seeds 16 --compile --device cuda --stages learn --products high
 
 One thread and CPU time, or with ``--device cuda`` the time until the GPU is done; both take turns
 in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make the 64 updates
 that a batch of frames earns as training makes them: sampling, each seed's random numbers and its
 own state of the generators are included. A ratio is to the same seeds one after another; times the
-number of seeds, it is to one of them alone.
+number of seeds, it is to one of them alone. ``--products high`` lets a GPU multiply in TF32.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from torchrl_etl.training import Stage
 from torchrl_etl.training.together import together
 from torchrl_etl.training.work import Work
 
+STAGES = ("explore", "learn")
 AT_ONCE = 64  # a batch of frames with one update for each
 
 
@@ -90,14 +91,17 @@ def main() -> None:
     )
     parser.add_argument("--compile", action="store_true")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
+    parser.add_argument("--products", choices=("highest", "high"), default="highest")
     arguments = parser.parse_args()
     quiet_torchrl()
     torch.set_num_threads(1)
 
-    more = {name: getattr(arguments, name) for name in ("seeds", "compile", "device")}
+    torch.set_float32_matmul_precision(arguments.products)
+    more = {name: getattr(arguments, name) for name in ("seeds", "compile", "device", "products")}
     overrides = [f"env={arguments.env}", f"device={arguments.device}"]
     overrides += [f"compile={str(arguments.compile).lower()}"]
-    for name in ("explore", "learn"):
+    for name in arguments.stages:
         stages = [filled(seed, name, *overrides) for seed in range(arguments.seeds)]
         values = measured(stages, arguments.repeats, AT_ONCE * arguments.block)
         other = values["one_by_one"]

@@ -89,6 +89,17 @@ def test_the_next_batch_that_is_asked_for_decodes_with_the_newest_decoder(start,
 
 
 @pytest.mark.slow
+def test_a_batch_is_collected_from_when_it_was_asked_for_on(start, policy):
+    batches = start("process")
+    batches.restart(seed=0)
+    batches.ask()
+    decodes_to(policy, 0.5)
+    batches.ask()  # again does nothing
+    assert batches.next()["action"].std() > 0
+    assert batches.next()["action"].allclose(torch.tensor(0.5))
+
+
+@pytest.mark.slow
 def test_an_optimizer_step_does_not_reach_a_rollout_unasked(start, policy):
     batches = start("process", ahead=True)
     batches.restart(seed=1)

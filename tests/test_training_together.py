@@ -54,6 +54,21 @@ def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
     assert frames == same and losses == pytest.approx(expected, rel=1e-3)
 
 
+def test_all_seeds_ask_for_a_batch_before_one_waits_for_it():
+    told = []
+
+    def waits(name, batches):
+        for _ in range(batches):
+            told.append(f"{name} asks")
+            yield
+            told.append(f"{name} has")
+        return name
+
+    assert together([waits("a", 2), waits("b", 1)]) == ["a", "b"]
+    assert told == ["a asks", "b asks", "a has", "a asks", "b has", "a has"]
+    assert alone(waits("c", 1)) == "c" and told[-2:] == ["c asks", "c has"]
+
+
 def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
     collect = Stage.collect
 

@@ -99,6 +99,11 @@ class Batches:
             if self._caller is None:  # workers have been reset by that already
                 self._collector.reset()
 
+    def ask(self) -> None:
+        """Let workers begin with the next batch, if there are some and they have not."""
+        if self._caller is not None and self._next is None:
+            self._next = self._ask()
+
     def next(self) -> TensorDictBase:
         """The next batch, with the collector's batch size."""
         batch = self._wait("give a batch", self._next or self._ask())

@@ -120,6 +120,8 @@ def run_stage(
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames
+            stage.ask()
+            yield
             report.batch(stage.collect(), (yield from stage.learn()))
             while stage.behind and not stop.requested:
                 yield from stage.learn()

@@ -157,6 +157,10 @@ class Stage:
     def finished(self) -> bool:
         return self.frames >= self.budget
 
+    def ask(self) -> None:
+        """Let workers begin with the next batch, by the policy as it is."""
+        self.batches.ask()
+
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the whole batch, flat."""
         batch = self.batches.next().to(self.device)

@@ -19,6 +19,7 @@ __all__ = ["together"]
 def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     """Do all works in turns, and updates that are due at the same time together.
 
+    Each asks its simulators for a batch before any of them waits for one.
     A work that is ahead of others in its stage, as one that was resumed can be, waits for them.
     Each work finds the random generators as it left them: it ends with the numbers of
     :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
@@ -39,9 +40,7 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     runs = [_Run(work) for work in works]
     groups: dict[tuple[SACLearner, ...], SideBySide] = {}
     try:
-        for run in runs:
-            run.go_on(None)
-        while waiting := [run for run in runs if run.due is not None]:
+        while waiting := _those_with_updates_due(runs):
             learners = {run.due.learner for run in waiting}
             for done in [group for group in groups if learners.isdisjoint(group)]:
                 del groups[done]  # which holds a copy of all their weights
@@ -62,6 +61,7 @@ class _Run(Generic[Result]):
     def __init__(self, work: Work[Result]) -> None:
         self.work, self.random = work, GlobalRNGState().state_dict()
         self.due: Due | None = None
+        self.ended = False
         self.result: Result | BaseException
 
     @property
@@ -80,9 +80,17 @@ class _Run(Generic[Result]):
             try:
                 self.due = self.work.send(scalars)
             except StopIteration as end:
-                self.due, self.result = None, end.value
+                self.due, self.ended, self.result = None, True, end.value
             except (Exception, Interrupted) as error:
-                self.due, self.result = None, error
+                self.due, self.ended, self.result = None, True, error
+
+
+def _those_with_updates_due(runs: Sequence[_Run]) -> list[_Run]:
+    """All that have not ended, once each of them has come to its next updates."""
+    while on := [run for run in runs if run.due is None and not run.ended]:
+        for run in on:
+            run.go_on(None)
+    return [run for run in runs if not run.ended]
 
 
 def _behind(runs: Sequence[_Run]) -> list[_Run]:

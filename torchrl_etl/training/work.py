@@ -1,4 +1,4 @@
-"""Work that pauses wherever updates are due, so that runs can take their updates together."""
+"""Work that pauses where it would wait, so that runs can do so together."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class Due(NamedTuple):
 
 
 # It yields what is due, is sent the scalars [k] of those updates, and returns what it is done for.
-Work: TypeAlias = Generator[Due, TensorDictBase, Result]
+# Before it waits for a batch that others collect it yields None, and goes on when told to.
+Work: TypeAlias = Generator[Due | None, TensorDictBase | None, Result]
 
 
 def alone(work: Work[Result]) -> Result:
@@ -33,6 +34,6 @@ def alone(work: Work[Result]) -> Result:
         try:
             due = next(work)
             while True:
-                due = work.send(due.learner.updates(due.inputs))
+                due = work.send(None if due is None else due.learner.updates(due.inputs))
         except StopIteration as end:
             return end.value
