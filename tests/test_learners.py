@@ -78,6 +78,15 @@ def test_a_loaded_optimizer_keeps_what_a_cuda_graph_reads():
     assert group["lr"] is rate and rate == 0.25 and group["capturable"]
 
 
+def test_rates_go_on_as_they_were_saved():
+    saved, loaded = (
+        GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.2, fused=True) for _ in range(2)
+    )
+    saved.scale_rates(0.5)
+    loaded.load_state_dict(saved.state_dict())
+    assert loaded.rates == [group["lr"] for group in loaded.param_groups] == [0.1]
+
+
 def test_an_ema_past_its_warm_up_is_pytorchs_and_copies_buffers():
     model = torch.nn.BatchNorm1d(2)
     ours = WarmedUpEMA(model, decay=0.3)

@@ -84,6 +84,18 @@ def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
     assert not (tmp_path / "1" / "summary.json").exists()
 
 
+def test_an_update_that_fails_ends_its_seeds_and_no_others(tmp_path, monkeypatch):
+    def full(group, inputs):
+        raise RuntimeError("the GPU is full")
+
+    monkeypatch.setattr(SideBySide, "updates", full)
+    works = [work(tmp_path / f"{i}", i, "method=sac") for i in (0, 1)]
+    works.append(work(tmp_path / "2", 2, "method=sac", "learn.batch_size=16"))
+    ends = together(works)
+    assert [str(end) for end in ends[:2]] == ["the GPU is full"] * 2
+    assert ends[2]["learn"]["frames"] == 416
+
+
 def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypatch):
     collect = Stage.collect
 

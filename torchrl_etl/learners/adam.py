@@ -76,12 +76,13 @@ class GradientAdam(Adam):
         return GradientAdam(groups)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the state of another one, perhaps of another device."""
+        """Take the state of another one, perhaps of another device; what rates began with stays."""
         kept = ("lr", "initial_lr", "capturable")
         own = [{key: group[key] for key in kept} for group in self.param_groups]
         super().load_state_dict(state_dict)
         for group, before in zip(self.param_groups, own, strict=True):
             loaded, lr = float(group["lr"]), before["lr"]
+            self.factor = loaded / group.get("initial_lr", loaded)
             group |= before
             # A CUDA graph reads a tensor, and that same tensor.
             group["lr"] = lr.fill_(loaded) if isinstance(lr, Tensor) else loaded

@@ -35,7 +35,7 @@ class Objective(nn.Module):
         reward (NestedKey): that reward, below ``"next"``. Default: ``"reward"``.
         transforms (sequence of Transform): what each batch goes through first, without gradients
             and with all networks as they are by then; those that they read and do not hold are
-            their ``networks``.
+            their ``networks``, whose buffers they may change if a term holds them, too.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ from torchrl_etl.objectives import FusedSoftUpdate
 __all__ = ["Gradients", "SACLearner"]
 
 Gradients: TypeAlias = tuple[tuple[Tensor | None, ...], TensorDictBase, tuple[Tensor, ...]]
-"""Of each parameter its own, scalars to log, and what transforms have for statistics afterwards."""
+"""Gradients in the order of ``parameters``, scalars to log, and new values of ``statistics``."""
 
 
 class SACLearner:
@@ -62,7 +62,8 @@ class SACLearner:
             collects. Default: the actor.
         terms (sequence of Term): further losses. Default: none.
         transforms (sequence of Transform): what each batch goes through at its update, with all
-            networks as they are by then: a bonus, say. Default: none.
+            networks as they are by then: a bonus, say. What one reads and does not hold is in its
+            attribute ``networks``. Default: none.
         normalizer (RunningNorm, optional): the networks read
             :data:`~torchrl_etl.learners.NORMALIZED`, which it makes of ``observation``.
         reward (NestedKey): what SAC learns on. Default: ``"reward"``.
@@ -155,7 +156,7 @@ class SACLearner:
         normalize_rows(self.unit_rows)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        self._counted = list(actor.parameters())
+        self._stepped = list(actor.parameters())
         self._draw = redrawn(self._loss)
         self._step_along(self.gradients)
 
@@ -211,12 +212,13 @@ class SACLearner:
         return loss, scalars, tuple(statistics.values())
 
     def only(self, *terms: Term) -> SACLearner:
-        """Takes gradient steps on these of its terms alone, by the same optimizer."""
+        """A learner that takes steps on these terms alone, with this one's optimizer."""
         twin = copy(self)
         twin.objective = self.objective.only(*terms)
-        twin.statistics, twin.unit_rows, twin.targets = {}, [], []
+        twin.statistics, twin.unit_rows = {}, []
+        twin.targets = [term.target for term in terms if term.target is not None]
         twin.ema = WarmedUpEMA(nn.Module(), 0.0)
-        twin._counted = list(twin.objective.terms.parameters())
+        twin._stepped = list(twin.objective.terms.parameters())
         twin._draw = redrawn(twin._loss)
         twin._step_along(twin.gradients)
         return twin
@@ -245,7 +247,7 @@ class SACLearner:
     @property
     def num_updates(self) -> int:
         """Updates up to now, as the optimizer has counted them."""
-        return self.optimizer.steps_of(self._counted)
+        return self.optimizer.steps_of(self._stepped)
 
     @property
     def pace(self) -> tuple[float, ...]:
@@ -264,7 +266,7 @@ class SACLearner:
     def over(
         self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Gradients]
     ) -> SACLearner:
-        """Makes the same updates along other gradients, of other parameters, targets and EMA."""
+        """A learner of the same updates along other gradients, of other parameters and targets."""
         twin = copy(self)
         twin.parameters = list(map(other, self.parameters))
         twin.unit_rows = list(map(other, self.unit_rows))

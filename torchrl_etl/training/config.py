@@ -186,8 +186,10 @@ def quoted(value: str) -> str:
 
 
 def to_go_on(folders: Sequence[Path]) -> str:
-    """The setting that goes on with the runs in these folders; Hydra reads a name that is not
-    plain only between quotation marks.
+    """The setting that goes on with the runs in these folders.
+
+    Hydra reads a name that is not plain only between quotation marks. A recipe puts them around a
+    single folder by itself, see :func:`~torchrl_etl.command_line.quote_paths`.
 
     Examples:
         >>> to_go_on([Path("runs/a"), Path("my runs/b")])

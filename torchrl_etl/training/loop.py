@@ -121,7 +121,7 @@ def run_stage(
         while not stage.finished:
             before = stage.frames
             stage.ask()
-            yield
+            yield  # the others ask, too, before this one waits
             report.batch(stage.collect(), (yield from stage.learn()))
             while stage.behind and not stop.requested:
                 yield from stage.learn()

@@ -86,7 +86,7 @@ class Stage:
         keep (sequence of NestedKey): further entries of a transition for the buffer.
         transforms (sequence of Transform): what sampled rows, those of many updates at once, go
             through; what depends on the updates before it is among the learner's ``transforms``.
-        updated (SACLearner, optional): has the updates. Default: ``learner``.
+        updated (SACLearner, optional): what is updated. Default: ``learner``.
         prefill_size (int): transitions to make room for beside the budget. Default: 0.
         action_repeat (int): frames that a transition of the collector takes. Default: 1.
         restart_seed (int): another one collects other episodes with the same ``seed``, so that a

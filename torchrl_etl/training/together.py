@@ -48,7 +48,14 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
             for run in _behind(waiting):
                 alike[run.alike].append(run)
             for each in alike.values():
-                _update(each, groups)
+                try:
+                    found = _updated(each, groups)
+                except Exception as fault:  # a GPU without memory, say
+                    for run in each:
+                        run.go_on(None, fault)
+                else:
+                    for run, scalars in zip(each, found, strict=True):
+                        run.go_on(scalars)
     finally:
         for run in runs:
             run.work.close()
@@ -75,10 +82,10 @@ class _Run(Generic[Result]):
     def __exit__(self, *error: Any) -> None:
         self.random = GlobalRNGState().state_dict()
 
-    def go_on(self, scalars: TensorDictBase | None) -> None:
+    def go_on(self, scalars: TensorDictBase | None, fault: Exception | None = None) -> None:
         with self:
             try:
-                self.due = self.work.send(scalars)
+                self.due = self.work.send(scalars) if fault is None else self.work.throw(fault)
             except StopIteration as end:
                 self.due, self.ended, self.result = None, True, end.value
             except (Exception, Interrupted) as error:
@@ -96,22 +103,21 @@ def _those_with_updates_due(runs: Sequence[_Run]) -> list[_Run]:
 def _behind(runs: Sequence[_Run]) -> list[_Run]:
     """Those that have had the fewest updates in their stage."""
     fewest: dict[str, int] = {}
-    for run in runs:
-        stage, updates = run.due.stage, run.due.learner.num_updates
-        fewest[stage] = min(updates, fewest.get(stage, updates))
-    return [run for run in runs if run.due.learner.num_updates == fewest[run.due.stage]]
+    updates = [run.due.learner.num_updates for run in runs]
+    for run, own in zip(runs, updates, strict=True):
+        fewest[run.due.stage] = min(own, fewest.get(run.due.stage, own))
+    return [run for run, own in zip(runs, updates, strict=True) if own == fewest[run.due.stage]]
 
 
-def _update(runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]) -> None:
-    """Update the learners of these runs, which are in the same stage."""
+def _updated(
+    runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]
+) -> list[TensorDictBase]:
+    """Scalars of the updates of these runs, which are in the same stage."""
     learners = tuple(run.due.learner for run in runs)
     if len(runs) == 1:
         with runs[0]:
-            scalars = learners[0].updates(runs[0].due.inputs)
-        return runs[0].go_on(scalars)
+            return [learners[0].updates(runs[0].due.inputs)]
     group = groups.get(learners)
     if group is None:
         group = groups[learners] = SideBySide(learners)
-    scalars = group.updates([run.due.inputs for run in runs])
-    for run, own in zip(runs, scalars, strict=True):
-        run.go_on(own)
+    return group.updates([run.due.inputs for run in runs])
