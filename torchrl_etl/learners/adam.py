@@ -48,10 +48,7 @@ class GradientAdam(Adam):
         """Set all learning rates to a share of those that they began with."""
         self.factor = factor
         for group, rate in zip(self.param_groups, self.rates, strict=True):
-            if isinstance(group["lr"], Tensor):  # read by a CUDA graph
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
+            _set_rate(group, rate)
 
     @property
     def moments(self) -> list[Tensor]:
@@ -81,11 +78,10 @@ class GradientAdam(Adam):
         own = [{key: group[key] for key in kept} for group in self.param_groups]
         super().load_state_dict(state_dict)
         for group, before in zip(self.param_groups, own, strict=True):
-            loaded, lr = float(group["lr"]), before["lr"]
+            loaded = float(group["lr"])
             self.factor = loaded / group.get("initial_lr", loaded)
             group |= before
-            # A CUDA graph reads a tensor, and that same tensor.
-            group["lr"] = lr.fill_(loaded) if isinstance(lr, Tensor) else loaded
+            _set_rate(group, loaded)
         for parameter, state in self.state.items():
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = _laid_out(state[moment], parameter)
@@ -142,6 +138,11 @@ class GradientAdam(Adam):
             if own:
                 walked.append((group, at, [own, *kept]))
         return walked
+
+
+def _set_rate(group: dict[str, Any], rate: float) -> None:
+    """Set a learning rate; a CUDA graph reads it from a tensor, and from that same tensor."""
+    group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
 
 
 def _laid_out(tensor: Tensor, parameter: Tensor) -> Tensor:

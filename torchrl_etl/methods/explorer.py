@@ -16,8 +16,7 @@ from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
 from torchrl_etl.training.context import Context
-from torchrl_etl.training.stage import AT_ONCE, parts
-from torchrl_etl.training.work import Due, Work
+from torchrl_etl.training.work import Work
 
 __all__ = ["Explorer", "make_exploration", "make_synergy_model"]
 
@@ -106,10 +105,10 @@ class Explorer:
         torch.manual_seed(self.seed)  # the same whether or not the run was resumed
         if self.term is None:
             self.model.fit(self.actions(), on_update=on_update)
-        due = 0 if self.term is None else self.final_updates
-        for count in parts(due, AT_ONCE[self.stage.device.type]):
-            on_update()
-            yield Due("synergies", self.fitter, self.fitter.inputs(self.stage.samples(count)))
+        else:
+            for few in self.stage.updates(self.final_updates, self.fitter, "synergies"):
+                on_update()
+                yield few
         return self.model.decoder(self.actions())
 
     def actions(self, count: int = 20_000) -> torch.Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +28,7 @@ from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
 from torchrl_etl.training.work import Due, Work
 
-__all__ = ["AT_ONCE", "Progress", "Stage", "parts"]
+__all__ = ["Progress", "Stage"]
 
 TRANSITION = (
     "observation",
@@ -187,11 +187,15 @@ class Stage:
         self.progress.owed -= due
         self.progress.updates += due
         logs = []
-        for count in parts(due, AT_ONCE[self.device.type]):
-            inputs = self.updated.inputs(self.samples(count))
-            logs.append((yield Due(self.name, self.updated, inputs)))
+        for few in self.updates(due, self.updated, self.name):
+            logs.append((yield few))
         self.learner.advance(self.frames, self.frames / self.budget)
         return torch.cat(logs).mean(0) if logs else None
+
+    def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[Due]:
+        """So many updates of a learner on sampled batches, a few at once, under this name."""
+        for few in parts(count, AT_ONCE[self.device.type]):
+            yield Due(name, learner, learner.inputs(self.samples(few)))
 
     def samples(self, count: int) -> TensorDictBase:
         """Batches [count, B] out of the buffer."""
