@@ -40,6 +40,7 @@ def faster_products() -> dict[Any, Callable[..., Any]]:
     capability = torch.backends.cpu.get_cpu_capability()
     if capability != "AVX512" or not torch.backends.mkldnn.is_available():
         return {}
+    from torch._inductor.ir import ExternKernel
     from torch._inductor.lowering import fallback_handler, permute, register_lowering
 
     linear = torch.ops.mkldnn._linear_pointwise.default
@@ -48,7 +49,8 @@ def faster_products() -> dict[Any, Callable[..., Any]]:
 
     @register_lowering(torch.ops.torchrl_etl.product.default, type_promotion_kind=None)
     def lower(a: Any, b: Any, bias: Any) -> Any:
-        return call(a, permute(b, [1, 0]), bias, "none", [], "")
+        # The kernel that makes it lays it out; oneDNN's operation would copy it, and slower.
+        return call(ExternKernel.require_contiguous(a), permute(b, [1, 0]), bias, "none", [], "")
 
     return {torch.ops.aten.mm.default: _mm, torch.ops.aten.addmm.default: _addmm}
 
@@ -60,13 +62,31 @@ def by_onednn(a: Tensor, b: Tensor) -> bool:
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor:
-    return torch.ops.torchrl_etl.product(a, _dense(b), None) if by_onednn(a, b) else NotImplemented
+    if by_onednn(a, b):
+        return torch.ops.torchrl_etl.product(a, _dense(b), None)
+    return _as_sum(a, b)
 
 
 def _addmm(bias: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float = 1) -> Tensor:
-    if beta == alpha == 1 and bias.shape == b.shape[1:] and by_onednn(a, b):
+    if beta != 1 or alpha != 1 or bias.shape != b.shape[1:]:
+        return NotImplemented
+    if by_onednn(a, b):
         # oneDNN takes no notice of a bias's strides.
         return torch.ops.torchrl_etl.product(a, _dense(b), bias.contiguous())
+    total = _as_sum(a, b)
+    return total if total is NotImplemented else bias + total
+
+
+def _as_sum(a: Tensor, b: Tensor) -> Tensor:
+    """A product with one row, one column or one inner index, which then joins the kernel that
+    makes its factors or reads it: a critic's single output, and its gradients."""
+    if a.device.type == "cpu":
+        if a.shape[1] == 1:
+            return a * b
+        if b.shape[1] == 1:
+            return (a * b.t()).sum(1, keepdim=True)
+        if a.shape[0] == 1:
+            return (a.t() * b).sum(0, keepdim=True)
     return NotImplemented
 
 
