@@ -16,11 +16,11 @@ from torchrl_etl.extras import extra
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training import evaluate_task, resumed_config
+from torchrl_etl.training.config import quoted
 from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.zoo import Card, describe_decoder, make_policy, save_entry
 
 with extra("recipes"):
-    from hydra.core.override_parser.types import Quote, QuotedString
     from hydra.errors import HydraException
     from omegaconf import DictConfig, OmegaConf
 
@@ -175,7 +175,7 @@ def _in_words(value: Any) -> str:
     if isinstance(value, dict):
         return "{" + ",".join(f"{key}:{_in_words(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str) and not _reads_as_itself(value):
-        return QuotedString(value, Quote.single).with_quotes()
+        return quoted(value)
     return str(value)
 
 

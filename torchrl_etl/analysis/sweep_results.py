@@ -17,23 +17,6 @@ from torchrl_etl.envs import list_tasks
 
 __all__ = ["COLUMNS", "RESULTS", "SweepResults", "SweepRow", "SweepRun", "read_sweep"]
 
-COLUMNS = (
-    "task",
-    "goal",
-    "method",
-    "seed",
-    "frames",
-    "return",
-    "solved",
-    "solved_time",
-    "episodes",
-    "wall_seconds",
-    "commit",
-    "versions",
-    "machine",
-    "status",
-)
-
 RESULTS = "results.csv"
 
 
@@ -67,6 +50,9 @@ class SweepRow(NamedTuple):
     versions: Mapping[str, str]
     machine: str
     status: str
+
+
+COLUMNS = tuple("return" if name == "mean_return" else name for name in SweepRow._fields[1:])
 
 
 @dataclass(frozen=True)

@@ -192,10 +192,8 @@ class DEPExploration(TensorDictModuleBase):
         length_key (NestedKey): Default: ``"muscle_length"``.
         episode_key (NestedKey, optional): what tells that an episode begins: a boolean that is true
             at its first step, as TorchRL's ``InitTracker`` writes, or an integer that differs
-            between episodes, such as ``("collector", "traj_ids")``, which collectors write (the
-            one to give where the collector takes no ``InitTracker``, as
-            ``torchrl_etl.collectors.VectorCollector``). Default: ``"is_init"``. Without the entry
-            all is one episode.
+            between episodes, such as ``("collector", "traj_ids")``, which collectors write.
+            Default: ``"is_init"``. Without the entry all is one episode.
         **controller: see :class:`DEPController`; the defaults are those of the paper for legs.
 
     Keys:

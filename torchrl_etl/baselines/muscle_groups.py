@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, step_mdp
 
 from torchrl_etl.checks import check_integer, check_real
-from torchrl_etl.envs import body_joints, mujoco_state
+from torchrl_etl.envs import HeldJoints, body_joints, mujoco_state, root_joints
 from torchrl_etl.extras import extra
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def _numbered(labels: np.ndarray) -> Tensor:
     return torch.from_numpy(first.argsort().argsort()[label]).long()
 
 
-class _Held:
+class _Held(HeldJoints):
     """Objects and a free root, which begin every step where the episode began.
 
     In the step nothing collides with an object, which a finger would only hit again and again. The
@@ -170,35 +170,19 @@ class _Held:
     """
 
     def __init__(self, model: mujoco.MjModel, state: mujoco.MjData) -> None:
-        import mujoco  # there, since its model is
-
-        self._model, self._state = model, state
         own = body_joints(model, state)
-        held = ~own | (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
-        self._positions = _entries(held, model.jnt_qposadr, model.nq)
-        self._velocities = _entries(held, model.jnt_dofadr, model.nv)
+        super().__init__(model, state, ~own | root_joints(model, state))
         # Every geom that hangs on an object's joint, by its kinematic tree.
         objects = np.unique(model.dof_treeid[model.jnt_dofadr[~own]])
         self._geoms = np.isin(model.body_treeid[model.geom_bodyid], objects)
-        self.remember()
-
-    def remember(self) -> None:
-        """What is held stays as it is now, at the beginning of an episode."""
-        self._pose = self._state.qpos[self._positions].copy()
+        self._collide = (model.geom_contype, model.geom_conaffinity)
 
     def __enter__(self) -> None:
-        self._state.qpos[self._positions] = self._pose
-        self._state.qvel[self._velocities] = 0
-        masks = (self._model.geom_contype, self._model.geom_conaffinity)
-        self._masks = [(mask, mask[self._geoms].copy()) for mask in masks]
-        for mask, _ in self._masks:
+        self.restore()
+        self._masks = [mask[self._geoms].copy() for mask in self._collide]
+        for mask in self._collide:
             mask[self._geoms] = 0
 
     def __exit__(self, *error: object) -> None:
-        for mask, before in self._masks:
+        for mask, before in zip(self._collide, self._masks, strict=True):
             mask[self._geoms] = before
-
-
-def _entries(joints: np.ndarray, first: np.ndarray, size: int) -> np.ndarray:
-    """Which entries of qpos or qvel [size] are of these joints, that begin at ``first``."""
-    return np.repeat(joints, np.diff(first, append=size))

@@ -107,6 +107,8 @@ class SARDecoder(SynergyMap):
             in_keys=list(in_keys),
             out_keys=list(out_keys),
         )
+        self.num_synergies, self.action_dim = basis.shape
+        self.residual = 1.0 - blend  # the share of an actuator's range that the raw action has
 
     @classmethod
     def fit(
@@ -172,19 +174,6 @@ class SARDecoder(SynergyMap):
         middle = (self.low + self.high) / 2
         synergies = (action - self.residual * middle) / self.module.blend - self.module.mean
         return (synergies @ self.module.basis.pinverse()).clamp(-1, 1)
-
-    @property
-    def num_synergies(self) -> int:
-        return self.module.basis.shape[0]
-
-    @property
-    def action_dim(self) -> int:
-        return self.module.basis.shape[1]
-
-    @property
-    def residual(self) -> float:
-        """Share 1 - φ of an actuator's range that the raw action has."""
-        return 1.0 - self.module.blend
 
     @property
     def low(self) -> Tensor:

@@ -16,13 +16,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import check_integer, check_real
-from torchrl_etl.collectors.seeds import training_seed
 
 __all__ = [
     "RemoteWorkers",
     "check_arguments",
     "cpu_copy",
     "seeded_env",
+    "training_seed",
     "weights_of",
     "worker_seed",
 ]
@@ -158,6 +158,20 @@ def seeded_env(create_env_fn: Callable[[], EnvBase], seed: int) -> EnvBase:
     env = create_env_fn()
     env.set_seed(seed)
     return env
+
+
+def training_seed(seed: int, offset: int) -> int:
+    """A seed for the part of a run that ``offset`` names.
+
+    It has its highest bit set, which no evaluation seed has.
+
+    Examples:
+        >>> training_seed(0, 0) == 2**30
+        True
+        >>> training_seed(1, 5) - training_seed(1, 0)
+        5
+    """
+    return 2**30 + (seed * 1_000_003 + offset) % 2**30
 
 
 def worker_seed(seed: int, index: int) -> int:

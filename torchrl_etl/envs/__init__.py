@@ -3,7 +3,7 @@
 import gymnasium
 
 from torchrl_etl.envs.analytic import AnalyticOveractuated
-from torchrl_etl.envs.body import body_joints, has_free_root
+from torchrl_etl.envs.body import HeldJoints, body_joints, has_free_root, root_joints
 from torchrl_etl.envs.body_synergies import body_decoder, body_synergies, muscle_changes
 from torchrl_etl.envs.factory import actuator_names, make_env
 from torchrl_etl.envs.joint_torques import JointTorques, excitation, joint_torques
@@ -16,6 +16,7 @@ from torchrl_etl.envs.wrappers import SimulationError
 __all__ = [
     "AnalyticOveractuated",
     "EnvironmentSpec",
+    "HeldJoints",
     "JointTorques",
     "SimulationError",
     "SynergyActionWrapper",
@@ -33,6 +34,7 @@ __all__ = [
     "mujoco_state",
     "muscle_changes",
     "resolve_task",
+    "root_joints",
 ]
 
 for _id, _goal in (("Overactuated-v0", "fixed"), ("OveractuatedRandom-v0", "random")):

@@ -1,4 +1,4 @@
-"""Which joints of a simulation are the body's own, and whether that body stands free."""
+"""Which joints of a simulation are the body's own, which of them float, and how they are held."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_etl.envs.simulator import mujoco_state
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["body_joints", "has_free_root"]
+__all__ = ["HeldJoints", "body_joints", "has_free_root", "root_joints"]
 
 
 def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -41,6 +41,13 @@ def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return np.isin(model.dof_treeid[model.jnt_dofadr], trees)
 
 
+def root_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Which joints [njnt] let the body float freely; arguments as for :func:`body_joints`."""
+    import mujoco  # there, since its model is
+
+    return body_joints(model, data) & (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+
+
 def has_free_root(env: EnvBase) -> bool:
     """Whether the body that actuators move floats freely, as legs do and a hand does not.
 
@@ -58,7 +65,31 @@ def has_free_root(env: EnvBase) -> bool:
     except ValueError:
         return False
     env.reset()
-    import mujoco
+    return bool(root_joints(model, data).any())
 
-    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
-    return bool((free & body_joints(model, data)).any())
+
+class HeldJoints:
+    """Joints that can be put back to where they were remembered, at rest.
+
+    Args:
+        model, data: of :func:`~torchrl_etl.envs.mujoco_state`, after a reset, which is remembered.
+        joints (np.ndarray): which joints [njnt] are held.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, joints: np.ndarray) -> None:
+        self._data = data
+        self._positions = _entries(joints, model.jnt_qposadr, model.nq)
+        self._velocities = _entries(joints, model.jnt_dofadr, model.nv)
+        self.remember()
+
+    def remember(self) -> None:
+        self._pose = self._data.qpos[self._positions].copy()
+
+    def restore(self) -> None:
+        self._data.qpos[self._positions] = self._pose
+        self._data.qvel[self._velocities] = 0.0
+
+
+def _entries(joints: np.ndarray, first: np.ndarray, size: int) -> np.ndarray:
+    """Which entries of qpos or qvel [size] are of these joints, that begin at ``first``."""
+    return np.repeat(joints, np.diff(first, append=size))

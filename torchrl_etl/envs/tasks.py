@@ -15,8 +15,8 @@ import gymnasium as gym
 
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs.myosuite import register_myosuite
-from torchrl_etl.envs.own_tasks import import_own_task
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
+from torchrl_etl.own_code import import_own
 
 __all__ = ["Task", "episode_length", "list_tasks", "resolve_task"]
 
@@ -258,8 +258,17 @@ def _in_dm_control(name: str) -> bool:
 
 
 def _registered(name: str) -> bool:
-    env_id = import_own_task(name)
-    if env_id not in gym.registry:
+    """Whether Gymnasium knows the id, after the import of what registers it in ``"module:id"``."""
+    module, _, env_id = name.rpartition(":")
+    if module:
+        # Gymnasium 1 loads no plugins: nothing else runs a user's gymnasium.register.
+        import_own(module, f"the task {name!r}; a task of your own is 'module:id'")
+        if env_id not in gym.registry:
+            raise ValueError(
+                f"Importing {module!r} registers no task {env_id!r}; register it in that module "
+                "with gymnasium.register, under an id with a version, such as 'MyTask-v0'."
+            )
+    elif env_id not in gym.registry:
         register_myosuite()
     return env_id in gym.registry
 

@@ -21,7 +21,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, make_batches
-from torchrl_etl.collectors.seeds import training_seed
+from torchrl_etl.collectors.remote import training_seed
 from torchrl_etl.io import reserve
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter

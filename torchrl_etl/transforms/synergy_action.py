@@ -19,10 +19,6 @@ class SynergyAction(LatentAction):
     A :class:`~torchrl_etl.transforms.LatentAction` that knows what a decoder says of itself: the
     policy acts in its ``synergy_spec``, and a body with other actuators or bounds is refused.
 
-    In a collector's batches root ``synergy`` and root ``action`` belong together. What the
-    simulator executed in the end is ``("next", "executed_action")``; root ``executed_action`` is
-    that of the step before.
-
     Equation: a = Dec(z^a) of section 4.2.
 
     Args:
@@ -37,10 +33,8 @@ class SynergyAction(LatentAction):
             :class:`~torchrl_etl.transforms.LatentAction`.
 
     Keys:
-        reads ``synergy`` [*, d] in [-1, 1]; writes ``("next", "executed_action")``, of the base
-        env's action spec, at reset ``executed_action``, zeros brought into the bounds, and, under a
-        collector, ``action`` [*, n] in [low, high]. In a group of agents all of them lie in the
-        group, if their keys say so.
+        those of :class:`~torchrl_etl.transforms.LatentAction`: ``synergy`` [*, d] in [-1, 1],
+        ``action`` [*, n] in [low, high].
 
     Raises:
         TypeError: if the decoder lacks keys or attributes, or the transform meets a replay buffer.

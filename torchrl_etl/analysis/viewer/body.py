@@ -68,7 +68,7 @@ class Body:
         self._placed = np.full((len(self._parts) + len(self._sites), 12), np.nan)
         self._shapes: dict[str, Any] = {}
         self._room: dict[str, int] = {}
-        self._followed = self._root() if follow else None
+        self._followed = int(moving_bodies(self._model)[0]) if follow else None
         self._ahead = np.zeros(3)
         self._place_camera()
         self.draw()
@@ -204,9 +204,6 @@ class Body:
             return
         handle.batched_positions, handle.batched_wxyzs = positions, wxyzs
         handle.batched_scales, handle.batched_colors = scales, shades
-
-    def _root(self) -> int:
-        return int(moving_bodies(self._model)[0])
 
     def _place_camera(self) -> None:
         middle, size = middle_and_size(self._model, self._data)

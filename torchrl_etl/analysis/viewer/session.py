@@ -16,9 +16,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type, step_mdp
 
-from torchrl_etl.analysis.viewer.held_root import HeldRoot
 from torchrl_etl.checks import check_choice, check_real
-from torchrl_etl.envs import Task, has_free_root, mujoco_state
+from torchrl_etl.envs import HeldJoints, Task, has_free_root, mujoco_state, root_joints
 from torchrl_etl.modules import SynergyMap
 
 __all__ = ["Driver", "Session", "Subject"]
@@ -130,7 +129,9 @@ class Session:
             self.model, self.data = mujoco_state(self.env)
         except ValueError:  # the analytic environment has no body
             self.model = self.data = None
-        self.root = HeldRoot(self.model, self.data) if has_free_root(self.env) else None
+        self.root = None
+        if has_free_root(self.env):
+            self.root = HeldJoints(self.model, self.data, root_joints(self.model, self.data))
         self.reset()
 
     # What a person does ------------------------------------------------------------------------
@@ -240,7 +241,10 @@ class Session:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             after = self.env.step(self._act(self._state))
         if self.driver == "sliders" and self.hold and self.root is not None:
+            import mujoco  # there, since its model is
+
             self.root.restore()
+            mujoco.mj_forward(self.model, self.data)
         outcome = after["next"]
         self.action = after["action"].flatten()
         self.steps += 1
