@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 
@@ -175,6 +176,7 @@ def make_stuck() -> TransformedEnv:
 def test_a_hanging_worker_is_not_waited_for_without_end():
     actor = make_actor({"observation": 3}, PointTaskSpec, hidden=(8,))
     batches = make_batches("process", make_stuck, actor, frames_per_batch=8)
+    batches.await_start()
     batches._timeout = 3.0
     with pytest.raises(CollectionError, match=r"did not give a batch within 3 s.*timeout"):
         for _ in range(4):
@@ -189,6 +191,7 @@ def test_a_hanging_worker_is_not_waited_for_without_end():
 PointTaskSpec = make_env("overactuated").full_action_spec_unbatched["action"][..., :5]
 
 LEARNER = """
+import threading
 import time
 from tests.test_collectors_process import *
 if __name__ == "__main__":
@@ -224,6 +227,40 @@ def test_workers_of_a_killed_learner_end_too(tmp_path):
     pytest.fail("the worker lives on")
 
 
+class Gathered:
+    """Workers that are there once all the others are."""
+
+    def __init__(self, there: threading.Barrier) -> None:
+        there.wait(20)
+
+    def __iter__(self):
+        return iter(())
+
+    def shutdown(self) -> None:
+        pass
+
+
+def test_the_workers_of_several_collectors_start_at_once():
+    there = threading.Barrier(2)
+    several = [Batches(partial(Gathered, there)) for _ in range(2)]
+    for batches in several:
+        batches.await_start()
+    for batches in several:
+        batches.close()
+
+
+def never_there():
+    raise RuntimeError("no simulator")
+
+
+def test_a_start_that_fails_is_told_to_whoever_waits_for_it_and_can_be_closed():
+    batches = Batches(never_there)
+    with pytest.raises(CollectionError, match="did not start: no simulator"):
+        batches.await_start()
+    batches.close()
+    Batches(never_there).close()
+
+
 def test_single_cannot_run_ahead():
     with pytest.raises(ValueError, match="takes a second process"):
         Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)
@@ -246,6 +283,7 @@ def test_the_learner_keeps_its_threads_and_who_asks_the_workers_has_one(monkeypa
     torch.set_num_threads(3)
     try:
         batches = Batches(Workers)
+        batches.await_start()
         assert batches._collector.threads == 1 and calls[-1] == 3
         batches.close()
         assert torch.get_num_threads() == 3 and calls[-1] == 3

@@ -69,6 +69,16 @@ def test_all_seeds_ask_for_a_batch_before_one_waits_for_it():
     assert alone(waits("c", 1)) == "c" and told[-2:] == ["c asks", "c has"]
 
 
+def test_the_workers_of_all_seeds_start_before_one_waits_for_them(tmp_path, monkeypatch):
+    told = []
+    for name in ("start_collection", "restart_collection"):
+        method = getattr(Stage, name)
+        tell = lambda stage, name=name, method=method: told.append(name) or method(stage)  # noqa: E731
+        monkeypatch.setattr(Stage, name, tell)
+    together([work(tmp_path / f"{seed}", seed, "method=sac") for seed in (0, 1)])
+    assert told[:3] == ["start_collection"] * 2 + ["restart_collection"]
+
+
 def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
     collect = Stage.collect
 

@@ -41,6 +41,9 @@ class Batches:
         timeout (float): most seconds to wait for anything: the start, a batch, a push.
             Default: 120.
 
+    Workers start as this is made, and are waited for by :meth:`await_start` or whatever needs them
+    first, so that several collectors can start at once.
+
     Raises:
         CollectionError: from every method, if workers fail or a wait passes its limit.
 
@@ -78,19 +81,27 @@ class Batches:
         self._next: Future[TensorDictBase] | None = None
         self._is_stuck = False
         self._collector: BaseCollector | None = None
-        with _threads_kept():
-            if self._caller is not None:
-                # With a team of OpenMP threads for the caller's operations there are more threads
-                # than cores, and libgomp puts the learner's to sleep between any two operations.
-                self._caller.call(torch.set_num_threads, 1)
-            self._collector = self._do("start", make_collector)
-        self._iterator = iter(self._collector)
+        if self._caller is not None:
+            # With a team of OpenMP threads for the caller's operations there are more threads
+            # than cores, and libgomp puts the learner's to sleep between any two operations.
+            self._caller.call(torch.set_num_threads, 1)
+        self._starting: Future[BaseCollector] | None = self._call(make_collector)
+        if in_process:
+            self.await_start()
+
+    def await_start(self) -> None:
+        """Wait until the workers are there."""
+        if self._collector is None:
+            with _threads_kept():
+                self._collector = self._wait("start", self._starting)
+            self._iterator = iter(self._collector)
 
     def restart(self, seed: int) -> None:
         """Begin new episodes that depend on the seed and the weights alone.
 
         A batch under way is dropped; it was never counted. A collector that cannot restart goes on.
         """
+        self.await_start()
         if self._restarts:
             if self._next is not None:
                 self._wait("give a batch", self._next)
@@ -112,22 +123,28 @@ class Batches:
 
     def close(self) -> None:
         """Stop the workers, by force if they do not listen; again does nothing."""
-        if self._collector is None:
+        if self._starting is None:
             return
+        if not self._is_stuck:
+            with suppress(Exception):  # who waited for the start has been told
+                self.await_start()
         collector, self._collector, self._iterator, self._next = self._collector, None, None, None
+        self._starting = None
         if self._is_stuck:  # the thread still waits for a worker; another one speaks to the rest
             _kill(collector)
             self._caller = _Caller()
         self._timeout = min(self._timeout, 30.0)
-        try:
-            with _threads_kept():
-                self._do("stop", collector.shutdown)
-        except CollectionError:
-            _kill(collector)
+        if collector is not None:  # it has started
+            try:
+                with _threads_kept():
+                    self._do("stop", collector.shutdown)
+            except CollectionError:
+                _kill(collector)
         if self._caller is not None:
             self._caller.stop()
 
     def _ask(self) -> Future[TensorDictBase]:
+        self.await_start()
         if self._caller is not None:
             self._do("take new weights", self._collector.update_policy_weights_)
         return self._call(next, self._iterator)

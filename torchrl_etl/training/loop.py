@@ -117,6 +117,8 @@ def run_stage(
     try:
         if not resumed and evaluate is not None:
             report.evaluation(evaluate())
+        stage.start_collection()
+        yield  # the workers of other seeds start meanwhile
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames

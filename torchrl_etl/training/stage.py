@@ -6,6 +6,7 @@ import gc
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -240,22 +241,34 @@ class Stage:
             rows = torch.cat([rows[writer._cursor :], rows[: writer._cursor]])
         return rows[-count:]
 
+    def start_collection(self) -> None:
+        """Let workers start, if there are none; :meth:`restart_collection` waits for them."""
+        if self.batches is None:
+            self._restart_policy()  # which workers copy as they start
+            # Only a run that begins or resumes builds a collector: that must not show.
+            with _numbers_undrawn():
+                self.batches = self._make_batches(seed=self._collection_seed)
+
     def restart_collection(self) -> None:
         """Begin new episodes, seeded by the frame count.
 
         A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
-        self.learner.restart(self.frames // self._frames_per_action)
+        self.start_collection()
+        with _numbers_undrawn():
+            self.batches.await_start()
+        self._restart_policy()
         if self.multi_step is not None:
             self.multi_step.forget()
-        seed = training_seed(self.seed, self.frames + 15_485_863 * self.restart_seed)
-        if self.batches is None:
-            # Only a run that begins or resumes builds a collector: that must not show.
-            random = GlobalRNGState().state_dict()
-            self.batches = self._make_batches(seed=seed)
-            GlobalRNGState().load_state_dict(random)
-        self.batches.restart(seed)
+        self.batches.restart(self._collection_seed)
+
+    def _restart_policy(self) -> None:
+        self.learner.restart(self.frames // self._frames_per_action)
+
+    @property
+    def _collection_seed(self) -> int:
+        return training_seed(self.seed, self.frames + 15_485_863 * self.restart_seed)
 
     def collect_from(self, **collector: Any) -> None:
         """Collect by other arguments of :func:`~torchrl_etl.collectors.make_batches`, from the next
@@ -282,6 +295,14 @@ class Stage:
             # garbage collector to come by.
             self.batches = None
             gc.collect()
+
+
+@contextmanager
+def _numbers_undrawn() -> Iterator[None]:
+    """Leave the random generators as they were."""
+    random = GlobalRNGState().state_dict()
+    yield
+    GlobalRNGState().load_state_dict(random)
 
 
 def check_budget(frames: int, replay_ratio: float) -> None:
