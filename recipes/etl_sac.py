@@ -90,6 +90,8 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
     arguments of ``Experiment``."""
     if config.resume is not None:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
+        if not folders:
+            raise ValueError("resume is []; name folders of runs, such as resume=runs/NAME.")
         defaults = hydra.compose("config")
         for folder in map(Path, folders):
             stored = settled(resumed_config(folder, given, defaults=defaults))

@@ -31,6 +31,17 @@ from torchrl_etl.training import Run, Sweep, validate
 
 HERE = Path(__file__).parent
 CONF = HERE / "conf"
+# What tells runs and their rows in the table apart, and what of a sweep says it.
+SAID_BY = {
+    "env": "tasks",
+    "goal": "tasks, as in TASK:random",
+    "method": "methods",
+    "seed": "seeds",
+    "seeds": "seeds",
+    "frames": "frames",
+    "run_dir": "out",
+    "resume": "out",
+}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="sweep")
@@ -67,11 +78,22 @@ def queue(config: DictConfig) -> list[Run]:
         value = config[name]
         if not isinstance(value, ListConfig) or not value:
             raise ValueError(f"{name} is {value!r}; it must be a list, such as {name}=[a,b].")
-    if len(set(config.seeds)) < len(config.seeds):
-        raise ValueError(f"seeds is {config.seeds}; it must be a list of different numbers.")
+        if len(set(value)) < len(value):
+            raise ValueError(f"{name} is {value}; each of them may be there once.")
+    for name in ("settings", "out"):
+        if not isinstance(config[name], str):
+            raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
+    settings = shlex.split(config.settings)
+    for setting in settings:
+        if (said_by := SAID_BY.get(setting.lstrip("+~").partition("=")[0])) is not None:
+            raise ValueError(
+                f"settings has {setting}, of which results.csv would not know; give {said_by}."
+            )
     for method in config.methods:
         check_choice("methods", method, methods)
     check_integer(1, frames=config.frames, attempts=config.attempts)
+    if config.jobs is not None:
+        check_integer(1, jobs=config.jobs)
     check_flag(seeds_at_once=config.seeds_at_once)
     folder = Path(config.out).resolve()
     runs = []
@@ -79,13 +101,7 @@ def queue(config: DictConfig) -> list[Run]:
         name, goal = split_goal(str(task))
         overrides = [f"env={name}", f"method={method}", f"seed={seed}"]
         overrides += [f"goal={goal}"] if goal else []
-        overrides += [
-            "threads=1",
-            "progress=false",
-            "pictures=false",
-            "log=[]",
-            *shlex.split(config.settings),
-        ]
+        overrides += ["threads=1", "progress=false", "pictures=false", "log=[]", *settings]
         path = folder / "-".join(
             filter(None, (name.replace(":", "-"), goal, method, f"seed{seed}"))
         )

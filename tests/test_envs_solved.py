@@ -81,6 +81,15 @@ def test_the_entry_that_means_success_can_be_named(num_envs):
     assert env.rollout(4)["next", "solved"][..., -1, :].all()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_name_that_info_never_has_is_told_at_the_end_of_the_first_episode():
+    env = make_env(ENDS, success_key="arived", env_kwargs={"key": "arrived"})
+    env.rollout(3)
+    with pytest.raises(RuntimeWarning, match=r"success_key is 'arived', .*it has arrived"):
+        env.rollout(4)
+    env.rollout(4)  # once
+
+
 @pytest.mark.parametrize(
     ("name", "steps"),
     [

@@ -28,6 +28,13 @@ MAKERS = {
         None, *RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]", *settings
     ),
     "stage 1": lambda *settings: explorer(*settings).stage,
+    "stage 1, no target encoder": lambda *settings: (
+        explorer(
+            "exploration.metric.delay_encoder=false",
+            "exploration.metric.divergence=gaussian",
+            *settings,
+        ).stage
+    ),
     "stage 1, RND": lambda *settings: explorer("exploration=rnd", *settings).stage,
     "stage 1, synergies alone": lambda *settings: explorer("exploration=noise", *settings).stage,
     "stage 1, METRA": lambda *settings: explorer("exploration=metra", *settings).stage,

@@ -159,6 +159,7 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("evaluate.py", "video_size=[a,b]", "two even whole numbers"),
         ("etl_sac.py", "myoHandPose", "not of the form key=value"),
         ("evaluate.py", "run=no (where)", "holds no run"),
+        ("etl_sac.py", "resume=[]", "resume is []; name folders of runs"),
         ("evaluate.py", "episodes=3", "no run is named; pass run=PATH"),
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],

@@ -206,7 +206,7 @@ def test_a_task_without_a_body_is_said_before_the_evaluation(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "egl")
     assert command("evaluate.py", "zoo=overactuated", "episodes=1", "video=true") != 0
-    assert "does not run on MuJoCo, so it cannot be drawn" in capsys.readouterr().err
+    assert "does not run on MuJoCo, whose bodies are drawn" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -44,4 +44,5 @@ def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
     mujoco = sys.modules.get("mujoco")  # whatever runs on it has imported it
     if mujoco and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         return model, data
-    raise ValueError(f"{type(inner).__name__} does not run on MuJoCo, so it cannot be drawn.")
+    name = type(inner).__name__
+    raise ValueError(f"{name} does not run on MuJoCo, whose bodies are drawn and analysed.")

@@ -8,6 +8,8 @@ without any per-key work, while ``info`` has none of these.
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -188,7 +190,7 @@ class NamedObservation(gym.Wrapper):
         muscle_lengths: bool = False,
     ):
         super().__init__(env)
-        self._success_key = success_key
+        self._success_key, self._sought = success_key, success_key is not None
         self._activations, self._muscle_lengths = activations, muscle_lengths
         entries: dict[str, spaces.Space] = {"observation": env.observation_space}
         if success_key is not None:
@@ -209,7 +211,22 @@ class NamedObservation(gym.Wrapper):
     def step(self, action: np.ndarray):
         observation, reward, terminated, truncated, info = self.env.step(action)
         solved = bool(np.any(info.get(self._success_key, False)))
+        if self._sought:
+            self._seek(info, terminated or truncated)
         return self._name_parts(observation, solved), reward, terminated, truncated, {}
+
+    def _seek(self, info: Mapping[str, Any], ended: bool) -> None:
+        """Say so if no step of the first episode has the key."""
+        missing = self._success_key not in info
+        self._sought = missing and not ended
+        if missing and ended:
+            warnings.warn(
+                f"success_key is {self._success_key!r}, which info had at no step of the first "
+                f"episode (it has {', '.join(map(str, info)) or 'nothing'}); without it nothing "
+                "counts as solved.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
     def _name_parts(self, observation: np.ndarray, solved: bool) -> dict[str, np.ndarray]:
         parts = {"observation": observation}

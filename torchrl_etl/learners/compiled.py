@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -130,8 +131,10 @@ def _options() -> dict[str, Any]:
     if _is_split(default_cache_dir()):  # where its headers are, whatever the cache is
         options["cpp_cache_precompile_headers"] = False
     if _is_split(TORCH_LIB_PATH):
-        # The symbols that a kernel needs are those of the process, which has loaded PyTorch.
+        # A kernel takes its symbols from the process instead, where PyTorch shows it them.
         options["aot_inductor.link_libtorch"] = False
+        library = os.path.join(TORCH_LIB_PATH, "libtorch_cpu.so")
+        ctypes.CDLL(library, mode=os.RTLD_GLOBAL | os.RTLD_NOLOAD)
     return options
 
 

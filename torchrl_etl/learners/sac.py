@@ -140,8 +140,8 @@ class SACLearner:
         decoded = {"action_spec": action_spec, "decoder": decoder, "train_decoder": train_decoder}
         entropy = {"target_entropy": target_entropy, "counted": counted, "alpha_init": alpha_init}
         critics = {"num_critics": num_critics, "bins": bins, "loss_function": loss_function}
-        sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
         scale = make_return_scale(gamma, return_bound)
+        sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
         units = {"normalizer": normalizer, "return_scale": scale, "reward": reward}
         self.objective = Objective(sac, actor, terms, **units, transforms=transforms)
         self.objective.to(self.device)

@@ -218,6 +218,7 @@ def make_critic(
         >>> critic(data)["state_action_value"].shape
         torch.Size([3, 1])
     """
+    check_integer(1, bins=bins)
     # Named here: ValueOperator calls it a state value unless a key is literally "action".
     return ValueOperator(
         make_layers(sum(inputs.values()), bins, body, hidden, layer_norm),

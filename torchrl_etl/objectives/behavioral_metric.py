@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.objectives.checks import check_parts
-from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners
+from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners, target_params
 
 __all__ = ["BehavioralMetricLoss"]
 
@@ -237,7 +237,7 @@ class BehavioralMetricLoss(LossModule):
     def _predict(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation [samples, k] of what follows, in the targets' space."""
         with torch.no_grad():
-            embedding = outputs(self.encoder, self.target_encoder_params, tensordict)
+            embedding = outputs(self.encoder, target_params(self), tensordict)
         inputs = TensorDict({self.dynamics.in_keys[0]: embedding}, embedding.shape[:-1])
         with self.dynamics_params.to_module(self.dynamics, preserve_module_state=False):
             written = self.dynamics(inputs)

@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_etl.draws import uniform_order
 
-__all__ = ["embedded_ends", "outputs", "partners"]
+__all__ = ["embedded_ends", "outputs", "partners", "target_params"]
 
 
 def partners(
@@ -45,6 +45,15 @@ def outputs(
     return written.get(network.out_keys[0]).flatten(0, -2)
 
 
+def target_params(loss: LossModule) -> TensorDictParams:
+    """Parameters of a loss's target encoder, or the encoder's own where it has no target.
+
+    TorchRL 0.14.1 gives out the latter's ``data`` then, which cannot be read under ``vmap``.
+    """
+    has_target = loss._modules.get("target_encoder_params") is not None
+    return loss.target_encoder_params if has_target else loss.encoder_params
+
+
 def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
     """Embeddings [samples, k] of both ends by a loss's encoder, the next by its target.
 
@@ -53,6 +62,6 @@ def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor,
     embedding = outputs(loss.encoder, loss.encoder_params, tensordict)
     with torch.no_grad():
         following = tensordict["next"]
-        next_embedding = outputs(loss.encoder, loss.target_encoder_params, following)
+        next_embedding = outputs(loss.encoder, target_params(loss), following)
         ended = following.get(loss.tensor_keys.terminated).reshape(-1, 1)
         return embedding, next_embedding.masked_fill(ended, 0.0)

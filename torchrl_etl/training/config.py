@@ -100,11 +100,12 @@ def validate(config: DictConfig) -> None:
     for name in ("env", "run_dir", "device"):
         if not isinstance(config[name], str) or not config[name]:
             raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
-    if not isinstance(config.env_kwargs, Mapping):
-        raise ValueError(
-            f"env_kwargs is {config.env_kwargs!r}; it must be arguments by name, such as "
-            "env_kwargs={NAME: VALUE}."
-        )
+    for name in ("env_kwargs", "logger_kwargs"):
+        if not isinstance(config[name], Mapping):
+            raise ValueError(
+                f"{name} is {config[name]!r}; it must be arguments by name, such as "
+                f"{name}={{NAME: VALUE}}."
+            )
     if config.compile not in (None, True, False):
         raise ValueError(f"compile is {config.compile!r}; it must be true, false or null.")
     key = config.success_key
