@@ -21,7 +21,6 @@ from torchrl_etl.training.evaluation import evaluate
 
 
 def make_decoder(residual: float = 0.0) -> SynergyDecoder:
-    torch.manual_seed(0)
     return SynergyDecoder.from_directions(
         torch.zeros(16), torch.randn(2, 16) / 4, residual=residual
     )

@@ -124,7 +124,6 @@ def test_rows_are_normalised_by_kappa() -> None:
 
 @pytest.mark.parametrize(("tau", "distance", "steps"), [(4, 2, 12), (3, 5, 20), (40, 5, 12)])
 def test_matrix_is_the_sum_of_the_paper(tau: int, distance: int, steps: int) -> None:
-    torch.manual_seed(0)
     rows, n = 2, 3
     controller = DEPController(rows, n, tau=tau, time_distance=distance, dtype=torch.float64)
     sensed = []
@@ -151,7 +150,6 @@ def test_a_body_at_rest_is_left_at_rest() -> None:
 
 
 def test_commands_are_bounded_and_finite_for_any_lengths() -> None:
-    torch.manual_seed(0)
     for size in (1e-8, 1.0, 1e4):
         controller = DEPController(3, 5)
         for _ in range(60):
@@ -160,7 +158,6 @@ def test_commands_are_bounded_and_finite_for_any_lengths() -> None:
 
 
 def test_a_reset_is_no_movement_and_forgets_nothing_else() -> None:
-    torch.manual_seed(0)
     controller = DEPController(3, 4)
     for _ in range(20):
         controller.step(torch.rand(3, 4))
@@ -176,7 +173,6 @@ def test_a_reset_is_no_movement_and_forgets_nothing_else() -> None:
 
 
 def test_rows_of_the_controller_are_independent() -> None:
-    torch.manual_seed(0)
     lengths, others = torch.rand(2, 30, 3, 4)
     others[:, 1] = lengths[:, 1]
     one, other = DEPController(3, 4), DEPController(3, 4)

@@ -68,7 +68,6 @@ def test_dep_acts_alone_for_its_frames_and_the_policy_afterwards() -> None:
 
 @pytest.mark.parametrize("length", [1, 5])
 def test_bursts_last_exactly_their_length(length: int) -> None:
-    torch.manual_seed(0)
     module = DEPExploration(SPEC, dep_frames=0, probability=0.1, intervention_length=length)
     acted = replaced(module, 400, rows=3)
     for row in acted.T:
@@ -81,7 +80,6 @@ def test_bursts_last_exactly_their_length(length: int) -> None:
 
 def test_share_of_bursts_is_that_of_the_probability() -> None:
     """A policy's step begins a burst with p: bursts per policy's step are p, within 3 sigma."""
-    torch.manual_seed(0)
     p, rows, steps = 0.02, 50, 300
     acted = replaced(DEPExploration(SPEC, dep_frames=0, probability=p), steps, rows)
     begins = (acted[1:] & ~acted[:-1]).sum().item()
@@ -91,7 +89,6 @@ def test_share_of_bursts_is_that_of_the_probability() -> None:
 
 @pytest.mark.parametrize("ids", [False, True])
 def test_every_third_episode_is_the_policys(ids: bool) -> None:
-    torch.manual_seed(0)
     key = ("collector", "traj_ids") if ids else "is_init"
     module = DEPExploration(SPEC, dep_frames=0, probability=0.5, episode_key=key)
     acted = replaced(module, 9 * 20, episode=20, ids=ids).view(9, 20, 2)
@@ -129,7 +126,6 @@ def test_it_passes_through_and_does_not_adapt_unless_exploration_is_random(
 
 def test_it_adapts_while_the_policy_acts() -> None:
     """The action of a burst is the one of a controller that saw every step."""
-    torch.manual_seed(0)
     module = DEPExploration(SPEC, dep_frames=0, probability=0.0)
     alone = DEPController(2, MUSCLES)
     for step in range(30):
@@ -151,7 +147,6 @@ def test_an_episodes_first_lengths_are_no_movement() -> None:
 
 
 def test_actions_fill_the_bounds_of_the_spec() -> None:
-    torch.manual_seed(0)
     low, high = torch.tensor([-3.0, 0.0, 1.0]), torch.tensor([-1.0, 1.0, 9.0])
     module = DEPExploration(Bounded(low, high))
     for _ in range(40):
@@ -195,7 +190,6 @@ def test_batch_shapes_and_nested_keys(batch: tuple[int, ...]) -> None:
 
 
 def test_rows_do_not_depend_on_others() -> None:
-    torch.manual_seed(0)
     lengths, others = torch.rand(2, 60, 3, MUSCLES)
     others[:, 1] = lengths[:, 1]
     seen = []
@@ -213,7 +207,6 @@ def test_rows_do_not_depend_on_others() -> None:
 
 
 def test_another_number_of_rows_starts_anew_but_for_the_frames() -> None:
-    torch.manual_seed(0)
     module = DEPExploration(SPEC, dep_frames=20, probability=0.0)
     replaced(module, 10, rows=2)
     assert module.controller.moves.any()

@@ -31,11 +31,6 @@ HIGH = torch.tensor([1.0, 1.0, 5.0, 0.7, 1.0, 1.0])
 SPEC = Bounded(LOW, HIGH, shape=(6,))
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 # Distribution
 
 

@@ -151,7 +151,6 @@ def kl(i: int, j: int) -> float:
 
 
 def test_divergence_of_policies_is_that_of_torch() -> None:
-    torch.manual_seed(0)
     loc, scale = torch.randn(2, 6), 0.1 + torch.rand(2, 6)
     actor = policy(loc.tolist(), scale.tolist())
     loss = EMELoss(table(*ROWS[:2]), predictors(PREDICTIONS[:2]), actor)
@@ -162,7 +161,6 @@ def test_divergence_of_policies_is_that_of_torch() -> None:
 
 
 def test_divergence_of_gaussians_is_that_of_the_squashed_policies() -> None:
-    torch.manual_seed(0)
     pairs = zip(LOC[:2], SCALE[:2], strict=True)
     first, second = (TanhNormal(torch.tensor(loc), torch.tensor(scale)) for loc, scale in pairs)
     action = first.sample((100_000,))
@@ -228,7 +226,6 @@ def test_ensemble_loss_and_variance_by_hand() -> None:
 
 
 def test_members_learn_on_their_own_subsets_with_the_same_expected_loss() -> None:
-    torch.manual_seed(0)
     count = 4_000
     data = transitions([0] * count, [1] * count, [1.0] * count, [False] * count, 3)
     whole = loss_of_tables(reduction="none")(data)["loss_reward_ensemble"]
@@ -240,7 +237,6 @@ def test_members_learn_on_their_own_subsets_with_the_same_expected_loss() -> Non
 
 
 def test_distances_on_a_cycle_come_to_the_fixed_point() -> None:
-    torch.manual_seed(0)
     # 0 -> 1 -> 2 -> 0 with rewards 0, 1, 2; divergences 1/2, 1/2 and 0, the same both ways.
     actor = policy([[0.0], [1.0], [0.0]], [[1.0]] * 3)
     encoder = table(*(0.1 * torch.randn(3, 2)).tolist())
@@ -277,7 +273,6 @@ def test_policies_that_always_differ_by_c_are_c_over_one_minus_gamma_apart(
 
 
 def test_ensemble_agrees_where_it_has_learned_and_nowhere_else() -> None:
-    torch.manual_seed(0)
     ensemble = RewardEnsemble(2, 1, hidden=(32,))
     actor = policy([[0.0]] * 2, [[1.0]] * 2)
     loss = EMELoss(StateEncoder(2, 2, hidden=(8,)), ensemble, actor)

@@ -23,11 +23,6 @@ SPEC = Bounded(LOW, HIGH, shape=(3,))
 KINDS = [{"state_dependent": False}, {"state_dependent": True}]
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def actor_on(spec: Bounded = SPEC, **kwargs: Any) -> Any:
     return make_lattice_actor({"observation": 4}, spec, hidden=(6,), **kwargs)
 

@@ -11,11 +11,6 @@ from tests.test_baselines_lattice import HIGH, LOW
 from torchrl_etl.baselines.lattice import LatticeNormal, lattice_scale_tril
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def gaussian(dim: int = 3, rows: int = 5, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
     root = torch.randn(rows, dim, dim, dtype=dtype)
     return torch.randn(rows, dim, dtype=dtype), torch.linalg.cholesky(

@@ -18,11 +18,6 @@ from torchrl_etl.collectors.policy_on_arrays import PolicyOnArrays
 from torchrl_etl.modules import make_actor
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def noisy(freq: int = 3, **kwargs: Any) -> LatticeNoise:
     return LatticeNoise(actor_on(state_dependent=True, **kwargs), freq=freq)
 

@@ -20,11 +20,6 @@ from torchrl_etl.envs import body_joints, make_env, mujoco_state
 GROUPS = [0, 1, 0, 2, 1, 0]
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def planted(frames: int = 600, noise: float = 0.01, seed: int = 0) -> Tensor:
     """Six muscles on three joints, in GROUPS; each in its own units, some a little off."""
     generator = torch.Generator().manual_seed(seed)

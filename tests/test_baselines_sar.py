@@ -31,7 +31,6 @@ def sources(rows: int = 500) -> Tensor:
 
 def planted(rows: int = 500, noise: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
     """Actions of three sources, the mixing [3, n] and the middle [n]."""
-    torch.manual_seed(0)
     mixing = torch.randn(SYNERGIES, MUSCLES, dtype=torch.float64) * 0.2
     middle = torch.rand(MUSCLES, dtype=torch.float64) * 0.4 - 0.2
     actions = middle + sources(rows) @ mixing
@@ -231,7 +230,6 @@ def test_actions_that_cannot_be_fitted_are_refused() -> None:
 
 
 def overactuated_decoder(blend: float) -> SARDecoder:
-    torch.manual_seed(0)
     activity = torch.rand(300, 2) @ torch.randn(2, 16)
     return SARDecoder.fit((0.3 * activity).clamp(-1, 1), 2, blend=blend)
 

@@ -26,7 +26,6 @@ def test_an_atom_goes_to_its_neighbours_by_nearness_and_to_the_ends_beyond_them(
 
 
 def test_projection_keeps_the_mass_and_within_the_ends_the_mean():
-    torch.manual_seed(0)
     probabilities = softmax(torch.randn(3, 4, 7), -1)
     atoms = 4 * torch.rand(3, 4, 7) - 2
     projected = project_categorical(probabilities, atoms, SUPPORT)

@@ -15,7 +15,6 @@ ROWS = 2000
 
 
 def policy(**kwargs) -> HeldNoise:
-    torch.manual_seed(0)
     actor = make_actor({"observation": 3}, Bounded(0, 1, shape=(2,)), hidden=(8,))
     return HeldNoise(actor, **kwargs)
 

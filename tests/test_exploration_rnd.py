@@ -51,7 +51,6 @@ def test_only_the_terms_loss_reaches_the_predictor(found):
 
 
 def test_the_bonus_of_what_the_predictor_learned_fades():
-    torch.manual_seed(0)
     spec = EnvironmentSpec.of(make_env("overactuated"))
     scale = {"normalize": False}
     rnd = RNDExploration(spec, features=8, hidden=[16], lr=1e-2, bonus=scale)

@@ -15,7 +15,6 @@ ROWS = 4000
 
 def drawn(noise: HeldNormal | PinkNormal, steps: int, rows: int = ROWS) -> torch.Tensor:
     """Noise [steps, rows] of one actuator from the first step of an episode on."""
-    torch.manual_seed(0)
     like, begins = torch.zeros(rows, 1), torch.zeros(rows, dtype=torch.bool)
     return torch.stack([noise(like, begins | (step == 0))[:, 0] for step in range(steps)])
 
@@ -50,7 +49,6 @@ def test_power_of_pink_noise_falls_as_one_over_frequency():
 
 @pytest.mark.parametrize("noise", [HeldNormal(1000, 0.01), PinkNormal(1024)], ids=["held", "pink"])
 def test_an_episode_that_begins_knows_nothing_of_the_one_before(noise):
-    torch.manual_seed(0)
     rows, like = ROWS, torch.zeros(ROWS, 1)
     begins = torch.arange(rows) < rows // 2
     first = noise(like, torch.ones(rows, dtype=torch.bool)).clone().squeeze(-1)

@@ -25,11 +25,6 @@ LOW, HIGH = [0.0, -1.0, -3.0, 0.1], [1.0, 1.0, 5.0, 0.7]
 BOUNDS = [(0.0, 1.0), (-1.0, 1.0), (LOW, HIGH)]
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def uniform(count: int, low: object = -1.0, high: object = 1.0, dim: int = 4) -> Tensor:
     low, high = torch.as_tensor(low), torch.as_tensor(high)
     return low + (high - low) * torch.rand(count, dim)
@@ -276,7 +271,6 @@ def test_a_critic_is_a_perceptron_on_its_joined_inputs() -> None:
 
 
 def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
-    torch.manual_seed(0)
     network = make_critic({"observation": 3}, body="residual", hidden=(4, 4)).module
     first, one, two, norm, head = network
     observation = torch.randn(6, 3)
@@ -289,7 +283,6 @@ def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
 
 
 def test_products_of_a_bfloat16_body_are_all_that_is_of_that_precision() -> None:
-    torch.manual_seed(0)
     exact = make_critic({"observation": 3}, body="residual", hidden=(16, 16)).module
     network = make_critic({"observation": 3}, body="residual_bfloat16", hidden=(16, 16)).module
     network.load_state_dict(exact.state_dict())

@@ -200,7 +200,6 @@ def test_dynamics_gradients_do_not_explode_where_the_spread_is_small() -> None:
 
 @pytest.mark.parametrize("divergence", ["sampled", "gaussian"])
 def test_bootstrapped_distances_stay_bounded(divergence: str) -> None:
-    torch.manual_seed(0)
     gamma, samples = 0.9, 64
     encoder = StateEncoder(OBSERVATION_DIM, EMBEDDING_DIM, hidden=(32, 32))
     dynamics = [GaussianDynamics(EMBEDDING_DIM, hidden=(32,))] if divergence == "gaussian" else []

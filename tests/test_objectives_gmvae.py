@@ -47,7 +47,6 @@ def actions(batch: int = 64) -> TensorDict:
 
 
 def test_loss_is_the_weighted_sum_of_its_terms() -> None:
-    torch.manual_seed(0)
     gmvae, data = GMVAE(ACTION_DIM, LATENT_DIM), actions()
     for kl_weight, component_kl_weight in ((1.0, 1.0), (0.5, 2.0), (0.0, 0.0)):
         loss = GMVAELoss(gmvae, kl_weight=kl_weight, component_kl_weight=component_kl_weight)
@@ -61,7 +60,6 @@ def test_loss_is_the_weighted_sum_of_its_terms() -> None:
 
 
 def test_action_units_do_not_change_the_loss() -> None:
-    torch.manual_seed(0)
     signed = GMVAE(ACTION_DIM, LATENT_DIM)
     unsigned = GMVAE(ACTION_DIM, LATENT_DIM, low=0.0, high=1.0)
     weights = {
@@ -98,7 +96,6 @@ def test_usage_entropy_tells_collapse_from_even_use() -> None:
 
 
 def test_training_recovers_synergies_that_are_there() -> None:
-    torch.manual_seed(0)
     mixing = torch.randn(LATENT_DIM, ACTION_DIM)
     action = torch.tanh(0.7 * torch.randn(512, LATENT_DIM) @ mixing)
     gmvae = GMVAE(ACTION_DIM, LATENT_DIM, hidden=(32,))

@@ -123,7 +123,6 @@ def test_embeddings_gain_nothing_by_more_room_than_epsilon() -> None:
     [("sum", 30.0, 1.0), ("sum", 0.1, 1.0), ("mean", 30.0, 2**0.5)],
 )
 def test_steps_on_a_chain_come_to_the_bound(norm: str, lambda_init: float, length: float) -> None:
-    torch.manual_seed(0)
     states = 5
     rows = (0.1 * torch.randn(states, 2)).tolist()
     loss = METRALoss(table(*rows), norm=norm, lambda_init=lambda_init)

@@ -89,7 +89,6 @@ def move(params: Any, by: float = 0.5) -> None:
 
 @pytest.fixture(params=[0.0, 0.3], ids=["synergies", "with a residual"])
 def loss(request: pytest.FixtureRequest) -> SynergySACLoss:
-    torch.manual_seed(0)
     loss = make_loss(loss_function="l2", alpha_init=0.3, residual=request.param)
     SoftUpdate(loss, tau=0.1)
     move(loss.target_qvalue_network_params.apply(lambda x: x.requires_grad_(False)))

@@ -25,11 +25,6 @@ AFFINE = ("pca", "nmf", "sar")
 FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden": (8,)}}
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def activity(rows: int = 400) -> Tensor:
     """Of six muscles in [0, 1], from two sources that are never negative."""
     return torch.rand(rows, 2) @ (torch.rand(2, 6) / 2)

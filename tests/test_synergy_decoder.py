@@ -17,11 +17,6 @@ from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import load_bundle, save_bundle
 
 
-@pytest.fixture(autouse=True)
-def seed() -> None:
-    torch.manual_seed(0)
-
-
 def fitted(residual: float = 0.0, **kwargs: object) -> tuple[GMVAE, SynergyDecoder, Tensor]:
     gmvae = GMVAE(4, 2, 3, low=LOW, high=HIGH, hidden=(8, 16))
     actions = uniform(4000, LOW, HIGH)

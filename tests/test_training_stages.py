@@ -71,7 +71,6 @@ def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
 
 
 def test_coefficients_of_decoded_actions_are_found_again():
-    torch.manual_seed(0)
     coefficients = 2 * torch.rand(512, 2) - 1
     actions = torch.tanh(coefficients @ torch.randn(2, 16))
     gmvae = fit_gmvae(GMVAE(16, 2, num_components=1), actions, updates=1500)

@@ -101,7 +101,6 @@ def test_same_torch_seed_gives_the_same_directions():
 
 @pytest.mark.parametrize("dimension", [2, 8])
 def test_sphere_is_uniform(dimension):
-    torch.manual_seed(0)
     draws = DirectionPrimer(dimension).draw(torch.Size([20_000]))
     torch.testing.assert_close(draws.norm(dim=-1), torch.ones(20_000))
     # A uniform unit vector has mean 0, covariance I/k and fourth moments 3/(k(k+2)).
@@ -112,7 +111,6 @@ def test_sphere_is_uniform(dimension):
 
 
 def test_sphere_in_one_dimension_is_a_fair_sign():
-    torch.manual_seed(0)
     draws = DirectionPrimer(1).draw(torch.Size([10_000]))
     assert set(draws.unique().tolist()) == {-1.0, 1.0}
     assert abs(draws.mean()) < 0.05
@@ -120,7 +118,6 @@ def test_sphere_in_one_dimension_is_a_fair_sign():
 
 @pytest.mark.parametrize("count", [None, 1, 3])
 def test_orthonormal_draws_are_rows_of_the_identity_equally_often(count):
-    torch.manual_seed(0)
     draws = DirectionPrimer(K, kind="orthonormal", num_directions=count).draw(torch.Size([8_000]))
     frequency = draws.mean(0)
     expected = torch.zeros(K)

@@ -102,7 +102,6 @@ def test_actions_that_are_no_flat_box_are_one_sentence():
 
 
 def test_a_policy_function_is_the_policy_without_noise():
-    torch.manual_seed(0)
     actor = make_actor({"observation": 6}, Bounded(-1, 1, shape=(16,)))
     act, seen = policy_function(actor), np.random.default_rng(0).random((4, 6))
     written = actor[0](TensorDict({"observation": torch.tensor(seen).float()}, [4]))
