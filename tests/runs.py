@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,9 @@ from pytest import MonkeyPatch
 
 from tests.configs import tiny
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.training import Interrupted
 from torchrl_etl.training.run_folder import RunFolder
+from torchrl_etl.training.stage import Stage
 
 WALL_CLOCK = ("frames_per_second", "wall_seconds")
 
@@ -42,3 +46,20 @@ def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
         patch.setattr(RunFolder, "remember_saved", remember_and_die)
         with pytest.raises(ZeroDivisionError):
             Experiment(tiny(f"run_dir='{run}'", *overrides)).run()
+
+
+def stopped(run: Path, *overrides: str, number: int = signal.SIGINT) -> Experiment:
+    """A tiny run that gets a signal in its seventh batch, upon which it saves and leaves."""
+    experiment = Experiment(tiny(f"run_dir='{run}'", *overrides))
+    collect = Stage.collect
+
+    def collect_and_signal(stage):
+        batch = collect(stage)
+        if stage.frames == 224:
+            os.kill(os.getpid(), number)
+        return batch
+
+    with MonkeyPatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(Stage, "collect", collect_and_signal)
+        experiment.run()
+    return experiment

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -12,15 +10,14 @@ import numpy as np
 import pytest
 
 from tests.configs import tiny
-from tests.runs import killed_when_saved, numbers
+from tests.runs import killed_when_saved, numbers, stopped
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.envs.analytic import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
-from torchrl_etl.training import Interrupted, resumed_config, run_folder
+from torchrl_etl.training import resumed_config, run_folder
 from torchrl_etl.training.run_folder import facts
-from torchrl_etl.training.stage import Stage
 
 ONLY_AT_THE_END = "checkpoint.every=100000"
 
@@ -61,7 +58,9 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_refused_and_its_rows_stay(co
         next(checkpoint.rglob("*.memmap")).unlink()
     with (
         pytest.warns(UserWarning, match="is damaged") as caught,
-        pytest.raises(OSError, match=r"All checkpoints in .*learn are damaged; copy them from"),
+        pytest.raises(
+            OSError, match=r"All checkpoints in .*learn are damaged; copy .* or start a new run"
+        ),
     ):
         resume(copy)
     assert sum("is damaged" in str(warning.message) for warning in caught) == 2
@@ -87,19 +86,9 @@ def test_so_is_one_whose_last_checkpoint_was_its_first(method, stage, tmp_path):
     assert before and rows(run) == before
 
 
-def test_so_is_one_that_was_stopped_before_its_first_checkpoint_was_due(tmp_path, monkeypatch):
+def test_so_is_one_that_was_stopped_before_its_first_checkpoint_was_due(tmp_path):
     run = tmp_path / "run"
-    collect = Stage.collect
-
-    def collect_and_signal(stage):
-        batch = collect(stage)
-        if stage.frames == 224:
-            os.kill(os.getpid(), signal.SIGINT)
-        return batch
-
-    with monkeypatch.context() as patch, pytest.raises(Interrupted):
-        patch.setattr(Stage, "collect", collect_and_signal)
-        Experiment(tiny(f"run_dir='{run}'", ONLY_AT_THE_END)).run()
+    stopped(run, ONLY_AT_THE_END)
     before = rows(run)
     shutil.rmtree(run / "checkpoints")
     with pytest.raises(OSError, match="at frame 224 of stage 'explore' and holds none"):
