@@ -8,9 +8,12 @@ import os
 import runpy
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import pytest
 from pytest import MonkeyPatch
 
 from tests.configs import ROOT
@@ -38,6 +41,19 @@ def begun(recipe: str, *overrides: str, cwd: Path) -> subprocess.Popen:
         cwd=cwd,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
+
+
+def wait_until(
+    condition: Callable[[], object], process: subprocess.Popen, seconds: float = 200
+) -> None:
+    """Wait for what a process brings about while it runs."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if process.poll() is not None:
+            output, _ = process.communicate(timeout=20)
+            pytest.fail(f"it ended before that, with {process.returncode}: {output}")
+        assert time.monotonic() < deadline, f"it did not come about in {seconds} seconds"
+        time.sleep(0.02)
 
 
 def command(recipe: str, *arguments: str) -> int:

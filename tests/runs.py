@@ -33,6 +33,10 @@ def numbers(run: Path) -> dict[str, str]:
     return {**scalars, "summary": json.dumps(summary)}
 
 
+def has_saved(run: Path, stage: str) -> bool:
+    return any(run.glob(f"checkpoints/{stage}/*/seal.json"))
+
+
 def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
     """A tiny run that ends, as if killed, when its checkpoint of so many frames is finished."""
 

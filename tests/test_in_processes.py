@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
-from pathlib import Path
 
-from tests.commands import begun
+from tests.commands import begun, wait_until
 from tests.configs import ROOT, TINY, tiny
-from tests.runs import numbers
+from tests.runs import has_saved, numbers
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.in_processes import in_processes
 
@@ -39,10 +37,7 @@ def test_a_process_that_is_killed_and_a_signal_to_stop_are_told_in_a_line_each(t
     arguments = [*TINY, "method=sac", "frames=100000", "seeds=[0,1]", f"run_dir='{tmp_path}/run'"]
     running = begun("etl_sac.py", *arguments, cwd=tmp_path)
     folders = [tmp_path / "run" / f"seed{seed}" for seed in (0, 1)]
-    deadline = time.monotonic() + 200
-    while not all(map(has_saved, folders)):
-        assert running.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until(lambda: all(has_saved(folder, "learn") for folder in folders), running)
     killed, _ = children(running.pid)
     os.kill(killed, signal.SIGKILL)
     running.send_signal(signal.SIGINT)
@@ -53,7 +48,3 @@ def test_a_process_that_is_killed_and_a_signal_to_stop_are_told_in_a_line_each(t
         output
     )
     assert "Traceback" not in output
-
-
-def has_saved(folder: Path) -> bool:
-    return any(folder.glob("checkpoints/learn/*/seal.json"))

@@ -11,14 +11,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.commands import begun, command, process
+from tests.commands import begun, command, process, wait_until
 from tests.configs import ROOT, TINY
+from tests.runs import has_saved
 from torchrl_etl.command_line import print_intervals, quote_paths
 from torchrl_etl.synergies import load_bundle, save_bundle
 
@@ -259,10 +259,7 @@ def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     arguments = [*TINY, "explore.frames=100000", f"run_dir='{folder}'"]
     running = begun("etl_sac.py", *arguments, cwd=tmp_path)
-    deadline = time.monotonic() + 120
-    while not list(folder.glob("checkpoints/explore/*/seal.json")):
-        assert running.poll() is None and time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: has_saved(folder, "explore"), running)
     running.send_signal(signal.SIGINT)
     output, _ = running.communicate(timeout=60)
     assert running.returncode == 130

@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.commands import wait_until
 from tests.configs import ROOT, TINY, tiny
-from tests.runs import killed_when_saved, numbers, stopped
+from tests.runs import has_saved, killed_when_saved, numbers, stopped
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
@@ -65,14 +66,6 @@ def collected(monkeypatch, experiment: Experiment) -> int:
     return sum(frames)
 
 
-def wait_for(path: Path, process: subprocess.Popen, seconds: float = 120) -> None:
-    deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert process.poll() is None, "the run ended before it could be killed"
-        assert time.monotonic() < deadline, f"{path} did not appear"
-        time.sleep(0.02)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """A run that nothing interrupted."""
@@ -98,7 +91,8 @@ def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(
 ):
     run = tmp_path / "a run"  # with a space
     process = start(command(run), tmp_path / "log.txt")
-    wait_for(run / "checkpoints" / stage / "checkpoint-000000000320" / "seal.json", process)
+    seal = run / "checkpoints" / stage / "checkpoint-000000000320" / "seal.json"
+    wait_until(seal.exists, process)
     time.sleep(random.uniform(0, 0.3))
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -182,15 +176,11 @@ def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, t
         text=True,
         start_new_session=True,
     )
-    rows = run / "csv/scalars/explore/updates.csv"
-    deadline = time.monotonic() + 200
-    while not rows.exists():
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_until((run / "csv/scalars/explore/updates.csv").exists, process)
     os.killpg(process.pid, signal.SIGTERM)
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 130, output
-    assert list(run.glob("checkpoints/explore/*/seal.json"))
+    assert has_saved(run, "explore")
     assert "Traceback" not in output
 
 

@@ -6,7 +6,6 @@ import csv
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +13,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
-from tests.commands import begun, command, process, recipe_module
+from tests.commands import begun, command, process, recipe_module, wait_until
 from tests.configs import CONF, ROOT, TINY
+from tests.runs import has_saved
 from torchrl_etl.analysis.sweep_results import COLUMNS
 from torchrl_etl.training import Run, Sweep
 
@@ -31,11 +31,7 @@ def results(out: Path) -> list[dict[str, str]]:
 def results_of_a_queue_that_was_killed(arguments, out: Path, *runs: str) -> list[dict[str, str]]:
     """Kill it as soon as these runs have saved once, and start it again."""
     running = begun("sweep.py", *arguments, cwd=out.parent)
-    deadline = time.monotonic() + 120
-    while not all(list((out / run).glob("checkpoints/learn/*/seal.json")) for run in runs):
-        assert running.poll() is None, running.stdout.read()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: all(has_saved(out / run, "learn") for run in runs), running)
     running.kill()
     running.wait()
     ended = process("sweep.py", *arguments, cwd=out.parent)
