@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from scipy.stats import kstest
 from tensordict import TensorDict
@@ -37,7 +36,8 @@ def test_every_step_is_distributed_as_the_actor_says():
     before_tanh = torch.atanh(2 * action - 1)
     standard = (before_tanh - distribution.loc) / distribution.scale
     assert kstest(standard.detach()[:, 0], "norm").pvalue > 0.01
-    assert standard.corrcoef()[0, 1].abs() < 1.0 + 1e-6
+    correlation = standard.mT.corrcoef()[0, 1]  # of the two actuators
+    assert correlation.abs() < 3 / ROWS**0.5
 
 
 def test_noise_lasts_as_long_as_the_zeta_distribution_says():
@@ -76,11 +76,3 @@ def test_its_memory_is_no_part_of_its_state():
     keys = set(held.state_dict())
     step(held, True)
     assert set(held.state_dict()) == keys
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "words"), [({"exponent": 0.0}, "exponent is 0"), ({"longest": 0}, "longest is 0")]
-)
-def test_unusable_settings_are_refused(kwargs, words):
-    with pytest.raises(ValueError, match=words):
-        policy(**kwargs)

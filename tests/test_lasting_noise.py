@@ -61,7 +61,7 @@ def test_settings_that_cannot_be_used_are_refused():
     for make, words in (
         (lambda: PinkNormal(0), "longest is 0"),
         (lambda: HeldNormal(0), "longest is 0"),
-        (lambda: HeldNormal(2, -1.0), "exponent is -1"),
+        (lambda: HeldNormal(2, 0.0), "exponent is 0"),
     ):
         with pytest.raises(ValueError, match=words):
             make()

@@ -187,12 +187,6 @@ def test_a_process_ends_with_that_sentence_and_no_traceback(recipe, override, wo
     assert not list(tmp_path.iterdir())
 
 
-def test_former_presets_and_null_still_mean_the_defaults(capsys):
-    former = ("learner=residual", "experiment=laptop", "faithful=null", "env=myoHandPos")
-    assert command("etl_sac.py", *former) == 2
-    assert "myoHandPose" in capsys.readouterr().err, "only the task is wrong"
-
-
 def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
     code = (
         "import os, sys\n"

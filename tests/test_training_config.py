@@ -162,25 +162,6 @@ def test_resuming_what_is_no_run_is_named(tmp_path):
         resumed_config(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "override",
-    [
-        "experiment=quick",
-        "actor.hidden=[16]",
-        "num_synergies=3",
-        "env=myoHandPose",
-        "learn.sac.num_critics=1",
-        "action_repeat=2",
-    ],
-)
-def test_what_would_make_it_another_run_cannot_be_changed_on_resume(override, tmp_path):
-    Experiment(tiny(f"run_dir='{tmp_path}/run'")).folder.open(resume=False)
-    before = (tmp_path / "run" / "config.yaml").read_text()
-    with pytest.raises(ValueError, match="cannot be changed when a run is resumed"):
-        resumed_config(tmp_path / "run", [override])
-    assert (tmp_path / "run" / "config.yaml").read_text() == before
-
-
 def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
     decoder = SynergyDecoder(3, 16)
     names = [f"muscle_{i}" for i in range(16)]

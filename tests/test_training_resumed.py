@@ -108,14 +108,22 @@ def test_a_newer_setting_can_be_answered_when_resuming(file, recwarn):
         (["seed=1"], "seed cannot be changed when a run is resumed"),
         (["+env_kwargs.g=1"], "env_kwargs.g cannot be changed when a run is resumed"),
         (["learner=plain"], "learner cannot be changed when a run is resumed"),
+        (["experiment=quick"], "experiment cannot be changed when a run is resumed"),
+        (["actor.hidden=[16]"], "actor.hidden cannot be changed when a run is resumed"),
+        (["num_synergies=3"], "num_synergies cannot be changed when a run is resumed"),
+        (["env=myoHandPose"], "env cannot be changed when a run is resumed"),
+        (["learn.sac.num_critics=1"], "learn.sac.num_critics cannot be changed when a run is"),
+        (["action_repeat=2"], "action_repeat cannot be changed when a run is resumed"),
         (["learn.frames=[1"], "learn.frames=[1"),
         (["frames=2000", "learn.frames=900"], "each sets the budget; give one."),
     ],
 )
 def test_what_cannot_be_asked_for_is_one_sentence(overrides, words, file):
+    before = file.read_text()
     with pytest.raises(ValueError, match=re.escape(words)) as caught:
         resumed_config(file.parent, overrides)
     assert "\n" not in str(caught.value)
+    assert file.read_text() == before
 
 
 def test_what_may_change_is_taken_also_below_a_section_of_another_library(file):
