@@ -22,7 +22,7 @@ from torchrl_etl.baselines.dynsyn import (
     set_frames,
 )
 from torchrl_etl.collectors.policy_on_arrays import PolicyOnArrays
-from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.modules import make_critic
 from torchrl_etl.objectives import LeanSACLoss
 
 GROUPS = [0, 1, 0, 2, 1, 0]  # first members 0, 1, 3; the others 2, 4, 5
@@ -238,21 +238,6 @@ def test_deviations_are_learned_only_once_they_are_allowed() -> None:
     actor = actor_on()
     actor.get_dist(observations(64)).rsample().sum().backward()
     assert not actor[0].module.layers[-1].weight.grad[6:].any()
-
-
-def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
-    inputs = {("agent", "observation"): 4, "direction": 2}
-    data = TensorDict(
-        {"agent": {"observation": torch.randn(5, 4)}, "direction": torch.randn(5, 2)}, [5]
-    )
-    common = {"out_key": ("agent", "action"), "body": "mlp", "hidden": (8,), "layer_norm": False}
-    for actor in (
-        make_actor(inputs, SPEC, **common),
-        make_dynsyn_actor(inputs, SPEC, torch.tensor(GROUPS), **common),
-    ):
-        assert actor.in_keys == list(inputs) and actor.dist_sample_keys == [("agent", "action")]
-        action = actor(data.clone())["agent", "action"]
-        assert action.shape == (5, 6) and (action >= LOW).all() and (action <= HIGH).all()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 
 from tests import test_objectives_sac as plain
 from torchrl_etl.baselines.lattice import LatticeNormal, StateDependentSpread, make_lattice_actor
-from torchrl_etl.modules import make_actor
 from torchrl_etl.objectives import LeanSACLoss
 
 LOW, HIGH = torch.tensor([0.0, -1.0, -3.0]), torch.tensor([1.0, 1.0, 5.0])
@@ -152,18 +151,6 @@ def test_actions_fill_the_bounds_and_stay_inside(kind: dict[str, bool], body: st
     height = (action - LOW) / (HIGH - LOW)
     assert (height.amin(0) < 0.1).all() and (height.amax(0) > 0.9).all()
     assert actor.spec["action"] == SPEC
-
-
-def test_same_call_as_make_actor_with_several_and_nested_keys() -> None:
-    inputs = {("agent", "observation"): 4, "direction": 2}
-    data = TensorDict(
-        {"agent": {"observation": torch.randn(5, 4)}, "direction": torch.randn(5, 2)}, [5]
-    )
-    common = {"out_key": ("agent", "action"), "body": "mlp", "hidden": (8,), "layer_norm": False}
-    for make in (make_actor, make_lattice_actor):
-        actor = make(inputs, SPEC, **common)
-        assert actor.in_keys == list(inputs) and actor.dist_sample_keys == [("agent", "action")]
-        assert actor(data.clone())["agent", "action"].shape == (5, 3)
 
 
 @pytest.mark.parametrize(

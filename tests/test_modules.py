@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
+from torchrl_etl.baselines.dynsyn import make_dynsyn_actor
+from torchrl_etl.baselines.lattice import make_lattice_actor
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.modules import (
     GMVAE,
@@ -240,6 +245,24 @@ def test_actor_fills_mixed_bounds_and_concatenates_its_inputs() -> None:
     assert spec.expand(5000, 4).is_in(action)
     unit = ActionDecoder(1, 4, low=LOW, high=HIGH).normalize(action)
     assert (unit.amin(0) < -0.9).all() and (unit.amax(0) > 0.9).all()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [make_actor, make_lattice_actor, partial(make_dynsyn_actor, groups=torch.tensor([0, 1, 0, 1]))],
+    ids=["plain", "lattice", "dynsyn"],
+)
+def test_actors_of_baselines_are_made_by_the_same_call_with_several_and_nested_keys(
+    make: Any,
+) -> None:
+    spec = Bounded(torch.tensor(LOW), torch.tensor(HIGH), shape=(4,))
+    inputs = {("agent", "observation"): 4, "direction": 2}
+    options = {"out_key": ("agent", "action"), "body": "mlp", "hidden": (8,), "layer_norm": False}
+    actor = make(inputs, spec, **options)
+    assert actor.in_keys == list(inputs) and actor.dist_sample_keys == [("agent", "action")]
+    data = {"agent": {"observation": torch.randn(5, 4)}, "direction": torch.randn(5, 2)}
+    action = actor(TensorDict(data, [5]))["agent", "action"]
+    assert spec.expand(5, 4).is_in(action)
 
 
 def test_quiet_entries_have_a_fixed_deviation_that_nothing_learns() -> None:

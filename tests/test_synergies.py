@@ -87,14 +87,18 @@ def test_nmf_finds_the_factors_that_were_planted() -> None:
     assert variance_accounted_for(actions, model.reconstruct(actions)) > 0.999
 
 
-def test_nmf_decodes_with_the_slope_of_its_factors_in_the_middle_of_the_box() -> None:
+@pytest.mark.parametrize(("kind", "origin"), [("nmf", "low"), ("sar", "mean")])
+def test_actions_are_decoded_with_the_models_slope_in_the_middle_of_the_box(
+    kind: str, origin: str
+) -> None:
+    """Models of actions: a = origin + c·basis."""
     actions = activity()
-    model = fitted("nmf", actions)
+    model = fitted(kind, actions)
     decoder = model.decoder(actions)
-    share = torch.tensor([0.01, 0.99])
-    ends = model.coefficients(actions).quantile(share, dim=0)
+    ends = model.coefficients(actions).quantile(torch.tensor([0.01, 0.99]), dim=0)
     at = torch.zeros(2)
-    torch.testing.assert_close(decoder.module(at), ends.mean(0) @ model.basis)
+    middle = getattr(model, origin) + ends.mean(0) @ model.basis
+    torch.testing.assert_close(decoder.module(at), middle)
     slope = torch.autograd.functional.jacobian(decoder.module, at)
     torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
 
@@ -112,17 +116,6 @@ def test_sar_finds_sources_that_are_independent_with_unit_variance() -> None:
     torch.testing.assert_close(
         coefficients.mT @ coefficients / 200, torch.eye(2), atol=1e-3, rtol=0
     )
-
-
-def test_sar_decodes_with_the_slope_of_its_components_in_the_middle_of_the_box() -> None:
-    actions = activity()
-    model = fitted("sar", actions)
-    decoder = model.decoder(actions)
-    ends = model.coefficients(actions).quantile(torch.tensor([0.01, 0.99]), dim=0)
-    at = torch.zeros(2)
-    torch.testing.assert_close(decoder.module(at), model.mean + ends.mean(0) @ model.basis)
-    slope = torch.autograd.functional.jacobian(decoder.module, at)
-    torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
 
 
 def test_sar_leaves_components_without_variance_as_they_are() -> None:
