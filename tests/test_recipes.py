@@ -122,6 +122,7 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path, capsys):
     assert command("etl_sac.py", *SMALL, *settings, f"run_dir='{tmp_path}/run'") == 2
     said = capsys.readouterr().err
     assert said.startswith("Error: ") and said.count("\n") == 1
+    assert "with no name in common" in said
 
 
 @pytest.mark.slow

@@ -137,13 +137,6 @@ def test_cuda_without_a_device_says_so():
         Experiment(tiny("device=cuda"))
 
 
-def test_a_bundle_for_other_muscles_is_refused(tmp_path):
-    decoder = SynergyDecoder(2, 3)
-    save_bundle(decoder, tmp_path / "other", task="arm", actuators=["a", "b", "c"])
-    with pytest.raises(ValueError, match="3"):
-        Experiment(tiny(f"synergies='{tmp_path}/other'"))
-
-
 def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'"))
     experiment.folder.open(resume=False)
