@@ -99,7 +99,9 @@ def _graph(
                 flat, decomposition_table=faster_products(), _allow_non_fake_inputs=True
             )
             traced = trace(*stand_ins)
-        with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(_options()):
+        # Calls between kernels in C++ rather than Python: 3 to 5 % of an update.
+        options = _options() | {"cpp_wrapper": all(each.device.type == "cpu" for each in inputs)}
+        with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(options):
             run = _inductor.compile(traced, stand_ins)
 
     def call(leaves: list[Tensor]) -> Any:
