@@ -35,7 +35,7 @@ def recipe(*overrides: str) -> DictConfig:
 
 
 def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
-    """The learn stage's policy, actor and decoder, at the sizes of the recipe."""
+    """The learn stage's policy: an actor of two layers of 256, a decoder of two of 128."""
     env = make_env(task)
     bounds = env.full_action_spec_unbatched["action"]
     inputs = {"observation": env.observation_spec["observation"].shape[-1]}

@@ -15,7 +15,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.checkpoints import Checkpoints, _size
-from torchrl_etl.training.stage import make_storage
+from torchrl_etl.training.storage import make_storage
 
 
 def buffer(capacity: int) -> TensorDictReplayBuffer:

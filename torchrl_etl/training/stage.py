@@ -16,17 +16,17 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, Storage, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, make_batches
 from torchrl_etl.collectors.remote import training_seed
-from torchrl_etl.io import reserve
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
+from torchrl_etl.training.storage import make_storage
 from torchrl_etl.training.work import Due, Work
 
 __all__ = ["Progress", "Stage"]
@@ -316,26 +316,6 @@ def check_budget(frames: int, replay_ratio: float) -> None:
     """
     check_integer(1, frames=frames)
     check_real("(0, 1000]", replay_ratio=replay_ratio)
-
-
-def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
-    """Room for ``size`` transitions, taken when the first one comes; in files with ``scratch``."""
-    if scratch is None:
-        return LazyTensorStorage(size, device=device)
-    # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
-    return ReservedMemmapStorage(size, scratch_dir=scratch, existsok=True)
-
-
-class ReservedMemmapStorage(LazyMemmapStorage):
-    """TorchRL's storage maps sparse files: a full disk would kill the run later, without a word."""
-
-    def _init(self, data: Any) -> None:
-        try:
-            super()._init(data)
-        except RuntimeError as error:  # how PyTorch says that a file cannot be so large
-            raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
-        for file in Path(self.scratch_dir).rglob("*.memmap"):
-            reserve(file)
 
 
 def parts(total: int, most: int) -> list[int]:
