@@ -58,6 +58,11 @@ def main(config: DictConfig) -> None:
     with one_sentence(*OPENING_FAULTS, CollectionError):
         runs = list(asked_for(config, list(HydraConfig.get().overrides.task)))
         apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
+        if len(runs) > 1 and not apart and runs[0]["config"].collector.kind == "distributed":
+            raise ValueError(
+                "collector.kind is 'distributed', of which a process has one; on a GPU, where "
+                "several seeds share a process, use process or ray."
+            )
         # Every one of them, before the first begins; with processes these say what there is to say.
         experiments = [
             Experiment(run["config"], resume=run["resume"]) if apart else Experiment(**run)

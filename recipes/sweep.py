@@ -34,7 +34,7 @@ CONF = HERE / "conf"
 # What tells runs and their rows in the table apart, and what of a sweep says it.
 SAID_BY = {
     "env": "tasks",
-    "goal": "tasks, as in TASK:random",
+    "goal": "tasks, as in TASK:random,",
     "method": "methods",
     "seed": "seeds",
     "seeds": "seeds",
@@ -84,11 +84,9 @@ def queue(config: DictConfig) -> list[Run]:
         if not isinstance(config[name], str):
             raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
     settings = shlex.split(config.settings)
-    for setting in settings:
+    for setting in translate(settings, CONF):
         if (said_by := SAID_BY.get(setting.lstrip("+~").partition("=")[0])) is not None:
-            raise ValueError(
-                f"settings has {setting}, of which results.csv would not know; give {said_by}."
-            )
+            raise ValueError(f"settings has {setting}, which is for {said_by} to say.")
     for method in config.methods:
         check_choice("methods", method, methods)
     check_integer(1, frames=config.frames, attempts=config.attempts)

@@ -25,8 +25,8 @@ def no_waiting_for_the_disk() -> None:
 
 
 @pytest.fixture(autouse=True)
-def seed() -> None:
-    """A test draws the same numbers whichever ran before it."""
+def same_numbers() -> None:
+    """What a test draws by PyTorch's generator does not depend on the tests before it."""
     if "torch" in sys.modules:  # not imported here: a test without it need not wait for it
         sys.modules["torch"].manual_seed(0)
 

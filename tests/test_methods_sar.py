@@ -56,7 +56,7 @@ def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
         len(play.buffer),
     )
     checks = []
-    rows = rollouts(play, 400, lambda: checks.append(None))
+    rows = alone(rollouts(play, 400, lambda: checks.append(None)))
     assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
     assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
     assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from tests.configs import RESIDUAL, tiny
 from tests.stages import changed, explorer, fill, learn_stage, prepared, snapshot
+from torchrl_etl.collectors import Batches, CollectionError
 from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import AnalyticOveractuated
 from torchrl_etl.experiment import Experiment
@@ -42,6 +43,25 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     torch.testing.assert_close(first["next", "reward"], 30 * kept["next", "reward"])
     assert (first["synergy"][:, decoder.num_synergies :] == 0).all()
     assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
+
+
+def test_after_a_start_that_failed_the_next_is_another_one(monkeypatch):
+    stage = learn_stage()
+    stage.close()
+
+    def never_there(**_):
+        def fail():
+            raise RuntimeError("no simulator")
+
+        return Batches(fail)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stage, "_make_batches", never_there)
+        with pytest.raises(CollectionError, match="did not start: no simulator"):
+            stage.restart_collection()
+    stage.restart_collection()
+    assert len(stage.collect()) > 0
+    stage.close()
 
 
 @pytest.mark.parametrize("ratio", [-1.0, math.nan, 1e9])

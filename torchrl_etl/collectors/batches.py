@@ -28,6 +28,10 @@ class Batches:
     as soon as one is delivered, so that it is collected while the learner learns; its policy is
     then one batch older, and everything is as reproducible as without.
 
+    Workers start as this is made, and are waited for by :meth:`await_start` or whatever needs them
+    first, so that several collectors can start at once. The start must draw no random numbers in
+    this process, which goes on meanwhile.
+
     Args:
         make_collector (callable): builds the collector.
 
@@ -38,11 +42,9 @@ class Batches:
             Default: ``False``.
         restarts (bool): whether the collector can begin new episodes from a seed while it runs.
             Default: ``True``.
-        timeout (float): most seconds to wait for anything: the start, a batch, a push.
+        timeout (float): most seconds to wait for anything: the start (from where it is waited for
+            on), a batch, a push.
             Default: 120.
-
-    Workers start as this is made, and are waited for by :meth:`await_start` or whatever needs them
-    first, so that several collectors can start at once.
 
     Raises:
         CollectionError: from every method, if workers fail or a wait passes its limit.
@@ -125,15 +127,15 @@ class Batches:
         """Stop the workers, by force if they do not listen; again does nothing."""
         if self._starting is None:
             return
+        self._timeout = min(self._timeout, 30.0)
         if not self._is_stuck:
-            with suppress(Exception):  # who waited for the start has been told
+            with suppress(Exception):  # a failed start is told to who waits for it, if anybody does
                 self.await_start()
         collector, self._collector, self._iterator, self._next = self._collector, None, None, None
         self._starting = None
         if self._is_stuck:  # the thread still waits for a worker; another one speaks to the rest
             _kill(collector)
             self._caller = _Caller()
-        self._timeout = min(self._timeout, 30.0)
         if collector is not None:  # it has started
             try:
                 with _threads_kept():

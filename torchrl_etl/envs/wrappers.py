@@ -222,8 +222,8 @@ class NamedObservation(gym.Wrapper):
         if missing and ended:
             warnings.warn(
                 f"success_key is {self._success_key!r}, which info had at no step of the first "
-                f"episode (it has {', '.join(map(str, info)) or 'nothing'}); without it nothing "
-                "counts as solved.",
+                f"episode (it has {', '.join(map(str, info)) or 'nothing'}); steps without it do "
+                "not count as solved.",
                 RuntimeWarning,
                 stacklevel=2,
             )

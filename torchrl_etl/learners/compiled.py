@@ -6,6 +6,7 @@ import ctypes
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import wraps
 from typing import Any
 
@@ -136,7 +137,8 @@ def _options() -> dict[str, Any]:
         # A kernel takes its symbols from the process instead, where PyTorch shows it them.
         options["aot_inductor.link_libtorch"] = False
         library = os.path.join(TORCH_LIB_PATH, "libtorch_cpu.so")
-        ctypes.CDLL(library, mode=os.RTLD_GLOBAL | os.RTLD_NOLOAD)
+        with suppress(OSError):  # elsewhere than on Linux it has another name
+            ctypes.CDLL(library, mode=os.RTLD_GLOBAL | os.RTLD_NOLOAD)
     return options
 
 

@@ -1,7 +1,8 @@
 """Matrix products of a compiled update by oneDNN, where PyTorch's own are slower.
 
 PyTorch multiplies by MKL, which leaves AVX-512 of AMD's processors alone (torch 2.13): half of the
-speed of oneDNN, which PyTorch has too and gives no function for.
+speed of oneDNN, which PyTorch has too and gives no function for. Where that is so, a product of
+one row or column becomes a sum.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from torch import Tensor
 
 __all__ = ["by_onednn", "faster_products", "multiply"]
 
-_SMALLEST = 16  # of either side; MKL is faster for a critic's single output
+_SMALLEST = 16  # of either side; MKL is faster below
 
 
 def multiply(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
@@ -80,7 +81,7 @@ def _addmm(bias: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float 
 def _as_sum(a: Tensor, b: Tensor) -> Tensor:
     """A product with one row, one column or one inner index, which then joins the kernel that
     makes its factors or reads it: a critic's single output, and its gradients."""
-    if a.device.type == "cpu":
+    if a.device.type == "cpu" and a.dtype.is_floating_point:
         if a.shape[1] == 1:
             return a * b
         if b.shape[1] == 1:

@@ -88,7 +88,7 @@ class SAR(Method):
         if not self.file.is_file():
             play = self.play_stage()
             yield from self.context.run_stage(play, stop)
-            actions = self.best(rollouts(play, self.rollout_frames, stop.check))
+            actions = self.best((yield from rollouts(play, self.rollout_frames, stop.check)))
             decoder = self.fit(actions)
             self._save_bundle(actions)
             # Last, since it says that all of this is done.
@@ -165,7 +165,7 @@ class SAR(Method):
         return self.context.stage(learner, keep=("synergy",))
 
 
-def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> TensorDictBase:
+def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[TensorDictBase]:
     """Steps [N] of new episodes of a stage's policy, acting as it explores, without learning.
 
     Args:
@@ -177,9 +177,13 @@ def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> TensorDict
     kept = [("next", key) for key in ("activation", "episode_reward", "done")]
     rows: list[TensorDictBase] = []
     try:
+        stage.start_collection()
+        yield
         stage.restart_collection()
         while stage.action_repeat * sum(map(len, rows)) < frames:
             check()
+            stage.ask()
+            yield
             batch = stage.batches.next().to(stage.device)
             rows.append(batch.select(*kept).set("episode", episode_numbers(batch)).reshape(-1))
     finally:

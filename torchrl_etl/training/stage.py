@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
-from torchrl_etl.collectors import Batches, make_batches
+from torchrl_etl.collectors import Batches, CollectionError, make_batches
 from torchrl_etl.collectors.remote import training_seed
 from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
@@ -256,8 +256,12 @@ class Stage:
         checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
         """
         self.start_collection()
-        with _numbers_undrawn():
-            self.batches.await_start()
+        try:
+            with _numbers_undrawn():
+                self.batches.await_start()
+        except CollectionError:
+            self._close_batches()  # so that the next call starts others
+            raise
         self._restart_policy()
         if self.multi_step is not None:
             self.multi_step.forget()
