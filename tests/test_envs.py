@@ -200,6 +200,9 @@ def test_a_wrong_number_of_envs_is_refused(num_envs):
 def test_a_wrong_number_of_repetitions_is_refused():
     with pytest.raises(ValueError, match="action_repeat is 0; it must be a whole number"):
         make_env("overactuated", action_repeat=0)
+    with pytest.raises(ValueError, match=r"action_repeat is 26, but .* has 25 steps"):
+        make_env("overactuated", action_repeat=26)
+    assert make_env("overactuated", action_repeat=25).rollout(3).shape == (1,)
 
 
 def test_building_is_silent(capfd, recwarn, tmp_path, monkeypatch):

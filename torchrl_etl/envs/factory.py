@@ -116,6 +116,11 @@ def make_env(
     """
     check_integer(1, num_envs=num_envs, action_repeat=action_repeat)
     task = resolve_task(name, goal)
+    if action_repeat > (steps := task.episode_steps or action_repeat):
+        raise ValueError(
+            f"action_repeat is {action_repeat}, but an episode of {task.name} has {steps} steps; "
+            "an action may last as long as that at most."
+        )
     build = partial(
         _build,
         task,
