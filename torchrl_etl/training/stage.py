@@ -6,7 +6,6 @@ import gc
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -246,8 +245,9 @@ class Stage:
         if self.batches is None:
             self._restart_policy()  # which workers copy as they start
             # Only a run that begins or resumes builds a collector: that must not show.
-            with _numbers_undrawn():
-                self.batches = self._make_batches(seed=self._collection_seed)
+            random = GlobalRNGState().state_dict()
+            self.batches = self._make_batches(seed=self._collection_seed)
+            GlobalRNGState().load_state_dict(random)
 
     def restart_collection(self) -> None:
         """Begin new episodes, seeded by the frame count.
@@ -257,8 +257,7 @@ class Stage:
         """
         self.start_collection()
         try:
-            with _numbers_undrawn():
-                self.batches.await_start()
+            self.batches.await_start()
         except CollectionError:
             self._close_batches()  # so that the next call starts others
             raise
@@ -299,14 +298,6 @@ class Stage:
             # garbage collector to come by.
             self.batches = None
             gc.collect()
-
-
-@contextmanager
-def _numbers_undrawn() -> Iterator[None]:
-    """Leave the random generators as they were."""
-    random = GlobalRNGState().state_dict()
-    yield
-    GlobalRNGState().load_state_dict(random)
 
 
 def check_budget(frames: int, replay_ratio: float) -> None:
