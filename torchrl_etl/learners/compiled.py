@@ -14,8 +14,11 @@ import torch
 from tensordict.nn import CudaGraphModule
 from tensordict.nn.functional_modules import _exclude_td_from_pytree
 from torch import Tensor, _inductor
+from torch._functorch.compile_utils import fx_graph_cse
 from torch._guards import TracingContext, tracing
+from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._subclasses import FakeTensorMode
+from torch.fx import Graph
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
@@ -102,6 +105,7 @@ def _graph(
             traced = trace(*stand_ins)
         # Calls between kernels in C++ rather than Python: 3 to 5 % of an update.
         options = _options() | {"cpp_wrapper": all(each.device.type == "cpu" for each in inputs)}
+        options["post_grad_custom_pre_pass"] = _Once()
         with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(options):
             run = _inductor.compile(traced, stand_ins)
 
@@ -110,6 +114,17 @@ def _graph(
             return tree_unflatten(run(*leaves), returned)
 
     return call
+
+
+class _Once(CustomGraphPass):
+    """What a graph computes in several places is computed once: the values of states that two
+    losses ask a critic for, say."""
+
+    def __call__(self, graph: Graph) -> None:
+        graph.owning_module.graph = fx_graph_cse(graph)
+
+    def uuid(self) -> bytes:
+        return get_hash_for_files((__file__,))
 
 
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -143,9 +143,9 @@ class IntrinsicReward(ScaledBonus):
     ) -> Tensor:
         direction_key = self.in_keys[1]
         direction = self._read(tensordict, direction_key)
-        # One pass through the encoder for both ends of the transition.
-        ends = evaluate(self.encoder, torch.stack([observation, next_observation]))
-        embedding, next_embedding = ends.to(direction).unbind(0)
+        # Each end by itself: a compiled update has the first from the encoder's own loss.
+        ends = observation, next_observation
+        embedding, next_embedding = (evaluate(self.encoder, end).to(direction) for end in ends)
         if embedding.shape[-1] != direction.shape[-1]:
             raise ValueError(
                 f"The encoder's embedding has {embedding.shape[-1]} dimensions but "
