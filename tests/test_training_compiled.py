@@ -40,7 +40,7 @@ def refuse(graph: torch.fx.Graph) -> None:
 @pytest.mark.parametrize(
     ("function", "patch", "words"),
     [
-        (slope, {"post_grad_custom_pre_pass": refuse}, "ValueError: this graph cannot be lowered;"),
+        (slope, {"post_grad_custom_post_pass": refuse}, "ValueError: this graph cannot be lowered"),
         (slope, NOWHERE, r"no C\+\+ compiler \(/nowhere/g\+\+ does not run\); install one"),
         (slope, {"cpp.cxx": (None, "false")}, "no C"),
         (a_branch_on_a_value, {}, "compile=false leaves out the attempt"),
@@ -59,6 +59,26 @@ def test_a_failed_compilation_says_why_and_gives_the_uncompiled_numbers(function
             outs.append(call(x))  # says nothing a second time
     torch.manual_seed(0)
     assert torch.equal(torch.stack(outs), torch.stack([function(x), function(x)]))
+
+
+def test_what_two_losses_ask_for_is_computed_once_and_what_changed_between_them_anew():
+    weight = torch.randn(20, 24, requires_grad=True)
+    count, graphs = torch.ones(()), []
+
+    def gradient(x: torch.Tensor) -> list[torch.Tensor]:
+        seen = count.clone()
+        first, before = (x @ weight).square().sum(), 2 * seen
+        seen += 1
+        second, after = (x @ weight.detach()).sum() * weight.sum(), 2 * seen
+        return [torch.autograd.grad(first + second, weight)[0], before, after]
+
+    x = torch.randn(32, 20)
+    with torch._inductor.config.patch(post_grad_custom_post_pass=graphs.append):
+        found = compiled(gradient)(x)
+    torch.testing.assert_close(found, gradient(x), rtol=1e-4, atol=1e-4)
+    kinds = torch.ops.aten.mm.default, torch.ops.torchrl_etl.product.default
+    # x @ weight, and in the gradient of its squares
+    assert sum(node.target in kinds for node in graphs[0].nodes) == 2
 
 
 @pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="a folder nobody can write to")

@@ -105,7 +105,7 @@ def _graph(
             traced = trace(*stand_ins)
         # Calls between kernels in C++ rather than Python: 3 to 5 % of an update.
         options = _options() | {"cpp_wrapper": all(each.device.type == "cpu" for each in inputs)}
-        options["post_grad_custom_pre_pass"] = _Once()
+        options["post_grad_custom_pre_pass"] = _ComputeOnce()
         with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(options):
             run = _inductor.compile(traced, stand_ins)
 
@@ -116,9 +116,11 @@ def _graph(
     return call
 
 
-class _Once(CustomGraphPass):
-    """What a graph computes in several places is computed once: the values of states that two
-    losses ask a critic for, say."""
+class _ComputeOnce(CustomGraphPass):
+    """Equal operations of a graph become one: two losses ask the same critic for the same states.
+
+    Inductor (torch 2.13) merges them in graphs that autograd splits in two, and in no others.
+    """
 
     def __call__(self, graph: Graph) -> None:
         graph.owning_module.graph = fx_graph_cse(graph)
