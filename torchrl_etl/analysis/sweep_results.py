@@ -204,25 +204,9 @@ def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> SweepRow:
     for name in ("task", "method", "status"):
         if not text[name]:
             raise ValueError(f"{where}: {name} is empty; every evaluation needs one.")
-    seed, frames = (_integer(where, name, text[name]) for name in ("seed", "frames"))
-    solved, solved_time = (_share(where, name, text[name]) for name in ("solved", "solved_time"))
-    return SweepRow(
-        line=line,
-        task=text["task"],
-        goal=text["goal"] or "fixed",
-        method=text["method"],
-        seed=seed,
-        frames=frames,
-        mean_return=_number(where, "return", text["return"]),
-        solved=solved,
-        solved_time=solved_time,
-        episodes=_number(where, "episodes", text["episodes"]),
-        wall_seconds=_number(where, "wall_seconds", text["wall_seconds"]),
-        commit=text["commit"],
-        versions=_versions(where, text["versions"]),
-        machine=text["machine"],
-        status=text["status"],
-    )
+    read = {name: parse(where, name, text[name]) for name, parse in _PARSERS.items()}
+    goal = text["goal"] or "fixed"
+    return SweepRow(line, *(text | read | {"goal": goal}).values())
 
 
 def _number(where: str, name: str, text: str) -> float:
@@ -246,11 +230,16 @@ def _share(where: str, name: str, text: str) -> float:
     return value
 
 
-def _versions(where: str, text: str) -> Mapping[str, str]:
+def _versions(where: str, name: str, text: str) -> Mapping[str, str]:
     try:
         versions = json.loads(text or "{}")
     except json.JSONDecodeError as error:
-        raise ValueError(f"{where}: versions is not a JSON text ({error}).") from error
+        raise ValueError(f"{where}: {name} is not a JSON text ({error}).") from error
     if not isinstance(versions, dict):
-        raise ValueError(f"{where}: versions must be a JSON object of names and versions.")
+        raise ValueError(f"{where}: {name} must be a JSON object of names and versions.")
     return {str(name): str(version) for name, version in versions.items()}
+
+
+_PARSERS = {"seed": _integer, "frames": _integer, "solved": _share, "solved_time": _share}
+_PARSERS |= {"return": _number, "episodes": _number, "wall_seconds": _number}
+_PARSERS |= {"versions": _versions}
