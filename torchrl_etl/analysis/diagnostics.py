@@ -105,20 +105,16 @@ def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | Array
     return float(np.mean((place * way).sum(1) / np.maximum(lengths, 1e-12)))
 
 
+_LEAST_VAF = 0.5  # of the model or of PCA
+_BEHIND_PCA = 0.02  # how far the model may stay behind it
+_LEAST_AUTHORITY = 0.2  # on average
 _CURE = "; ask for more synergies, or for those of another kind"
 _UNDERFITTED = ": it is underfitted, so train it longer or lower the weight of its KL terms"
 _CURES = {"gmvae": _UNDERFITTED, "vae": _UNDERFITTED}
 
 
 def synergy_warnings(
-    *,
-    vaf: float,
-    pca_vaf: float,
-    authority: Tensor | ArrayLike,
-    kind: str = "gmvae",
-    min_vaf: float = 0.5,
-    pca_tolerance: float = 0.02,
-    min_authority: float = 0.2,
+    *, vaf: float, pca_vaf: float, authority: Tensor | ArrayLike, kind: str = "gmvae"
 ) -> list[str]:
     """Say in words what is wrong with a synergy space; an empty list means nothing was found.
 
@@ -127,10 +123,6 @@ def synergy_warnings(
         pca_vaf (float): variance that PCA accounts for with as many dimensions.
         authority (Tensor or array): what :func:`control_authority` returned [n].
         kind (str): of the synergy model. Default: ``"gmvae"``.
-        min_vaf (float): least acceptable share of the variance, by the model or by PCA.
-            Default: 0.5.
-        pca_tolerance (float): how far the model may stay behind PCA. Default: 0.02.
-        min_authority (float): lowest acceptable mean authority. Default: 0.2.
 
     Returns:
         list of str: one sentence per finding, with its numbers and what helps.
@@ -145,26 +137,25 @@ def synergy_warnings(
         them to actions that vary more.
     """
     found, name = [], kind.upper()
-    if max(vaf, pca_vaf) < min_vaf:
+    if max(vaf, pca_vaf) < _LEAST_VAF:
         found.append(
             f"The actions hardly have synergies: the {name} accounts for {vaf:.0%} of their "
-            f"variance and PCA for {pca_vaf:.0%} ({min_vaf:.0%} is the least advised); fit on the "
-            "policy's "
-            "mean actions or on muscle activations instead of sampled actions, or raise the number "
-            "of synergies."
+            f"variance and PCA for {pca_vaf:.0%} ({_LEAST_VAF:.0%} is the least advised); fit on "
+            "the policy's mean actions or on muscle activations instead of sampled actions, or "
+            "raise the number of synergies."
         )
-    if vaf < pca_vaf - pca_tolerance:
+    if vaf < pca_vaf - _BEHIND_PCA:
         found.append(
             f"The {name} accounts for {vaf:.1%} of the actions' variance, less than PCA's "
             f"{pca_vaf:.1%} with as many dimensions{_CURES.get(kind, _CURE)}."
         )
     authority = as_array(authority)
-    if authority.mean() < min_authority:
+    if authority.mean() < _LEAST_AUTHORITY:
         still = int((authority < 0.01).sum())
         idle = f"; {still} of {authority.size} actuators move less than 1%" if still else ""
         found.append(
             f"The synergies move an actuator over {authority.mean():.0%} of its range on average "
-            f"({min_authority:.0%} is the least advised{idle}): learn on them only with a "
+            f"({_LEAST_AUTHORITY:.0%} is the least advised{idle}): learn on them only with a "
             "residual, or fit them to actions that vary more."
         )
     return found
