@@ -111,15 +111,8 @@ _PAPER = (
     _dm_control("dog-run"),
 )
 
-_ANALYTIC = Task(
-    "overactuated",
-    "torchrl_etl/Overactuated-v0",
-    "torchrl_etl/OveractuatedRandom-v0",
-    "gymnasium",
-    25,
-    True,
-    6,
-)
+_IDS = "torchrl_etl/Overactuated-v0", "torchrl_etl/OveractuatedRandom-v0"
+_ANALYTIC = Task("overactuated", *_IDS, "gymnasium", 25, True, 6)
 
 # Their rewards are negative and a drop ends them, so that dropping early can pay. Where it ends
 # nothing, it does not.
@@ -130,15 +123,7 @@ _FULL = tuple(
 )
 
 # The Hand Pose that others have published results of; MyoSuite 3's is another task.
-_MYO2 = Task(
-    "myo2HandPose",
-    "torchrl_etl/Myo2HandPoseFixed-v0",
-    "torchrl_etl/Myo2HandPoseRandom-v0",
-    "myosuite",
-    100,
-    True,
-    _MYOSUITE_STEPS,
-)
+_MYO2 = replace(_hand("torchrl_etl/Myo2HandPose", 100), name="myo2HandPose")
 
 _BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _MYO2, _ANALYTIC)}
 _BY_ID = {
