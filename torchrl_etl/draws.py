@@ -18,7 +18,6 @@ from torch import Tensor
 __all__ = [
     "Draw",
     "given_draws",
-    "recorded_draws",
     "redrawn",
     "standard_normal",
     "standard_uniform",
@@ -73,23 +72,6 @@ def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
         _source.given = None
 
 
-@contextmanager
-def recorded_draws() -> Iterator[list[Draw]]:
-    """Remembers what is drawn within, in a list of functions that draw the like again.
-
-    Examples:
-        >>> with recorded_draws() as draws:
-        ...     _ = standard_normal(torch.zeros(2, 3))
-        >>> [draw(16).shape for draw in draws]
-        [torch.Size([16, 2, 3])]
-    """
-    _source.recorded = []
-    try:
-        yield _source.recorded
-    finally:
-        _source.recorded = None
-
-
 def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
     """Draws what ``function`` would in so many calls, from the generators as they are.
 
@@ -106,8 +88,12 @@ def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
     def draws(calls: int, *args: Any) -> list[Tensor]:
         shapes = tuple(each.shape for each in args)
         if shapes not in known:
-            with torch.random.fork_rng(), recorded_draws() as found, torch.no_grad():
-                function(*args)
+            found = _source.recorded = []
+            try:
+                with torch.random.fork_rng(), torch.no_grad():
+                    function(*args)
+            finally:
+                _source.recorded = None
             known[shapes] = found
         return [draw(calls) for draw in known[shapes]]
 
