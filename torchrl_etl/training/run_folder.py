@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import os
 import platform
@@ -144,10 +142,8 @@ class RunFolder:
     def forget_after(self, stage: str, frame: int) -> None:
         """Drop the rows of ``stage`` later than ``frame``, which a resumed run will write again."""
         for path in sorted((self.scalars / stage).rglob("*.csv")):
-            rows = [row for row in _read(path) if row[0] <= frame]
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(rows)
-            write_atomically(path, text.getvalue())
+            rows = (f"{at},{value}\n" for at, value in _read(path) if at <= frame)
+            write_atomically(path, "".join(rows))
         if frame >= 0:
             self._purge_step = frame + 1
 
