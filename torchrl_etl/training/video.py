@@ -164,13 +164,16 @@ class EpisodeRecorder:
 
     def draw(self) -> np.ndarray:
         """The present state [H, W, 3]."""
+        import mujoco  # there, since its model is
+
         from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
 
         self._renderer.update_scene(self._data, self._camera or self._view())
         shades = colors(activations(self._model, self._data)) / 255
         pulled = pulled_tendons(self._model)
-        for geom in self._tendons():
-            if geom.objid in pulled:
+        scene, tendon = self._renderer.scene, int(mujoco.mjtObj.mjOBJ_TENDON)
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.objtype == tendon and geom.objid in pulled:
                 geom.matid, geom.rgba[:3] = -1, shades[pulled[geom.objid]]
                 geom.emission = 0.5  # the colour is what is to be read, not its shading
         if self._framed is not None and not self._follows:
@@ -202,13 +205,6 @@ class EpisodeRecorder:
         view.lookat, view.distance = middle, 1.35 * size
         view.azimuth, view.elevation = self._azimuth, -24.0
         return view
-
-    def _tendons(self) -> list[Any]:
-        import mujoco  # there, since its model is
-
-        scene = self._renderer.scene
-        tendon = int(mujoco.mjtObj.mjOBJ_TENDON)
-        return [geom for geom in scene.geoms[: scene.ngeom] if geom.objtype == tendon]
 
     def close(self) -> None:
         """Give back what the drawing took; the environment stays open."""
