@@ -170,7 +170,8 @@ def _reason(error: BaseException) -> str:
     for cause in _causes(error):
         match cause:
             case InvalidCxxCompiler():
-                *_, name = _as_tuple(torch._inductor.config.cpp.cxx)
+                names = torch._inductor.config.cpp.cxx
+                name = names if isinstance(names, str) else names[-1]
                 return (
                     f"there is no C++ compiler ({name} does not run); install one "
                     "(apt install g++), or name one in the variable CXX"
@@ -195,10 +196,6 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
     if error is not None:
         yield from _causes(getattr(error, "inner_exception", None) or error.__cause__)
         yield error
-
-
-def _as_tuple(value: Any) -> tuple[Any, ...]:
-    return tuple(value) if isinstance(value, (list, tuple)) else (value,)
 
 
 def _first_line(text: str) -> str:
