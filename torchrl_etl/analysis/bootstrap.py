@@ -23,15 +23,8 @@ __all__ = ["iqm", "mean_band", "probability_of_improvement"]
 def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
     """Interquartile mean of the runs of all tasks, with its stratified bootstrap 95 % interval.
 
-    Args:
-        groups (sequence of array-like): for each task, one number per seed; their numbers of seeds
-            may differ.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples; 0 leaves the interval away. Default: 2000.
-
-    Returns:
-        Interval: the ends are NaN where a task has one seed, which says nothing about its spread.
+    ``groups`` have for each task one number per seed. The ends are NaN where a task has one seed,
+    which says nothing about its spread, and without ``repetitions``, which are resamples.
 
     Examples:
         >>> iqm([[1.0, 2.0, 3.0, 100.0]], repetitions=50).mean
@@ -46,15 +39,8 @@ def probability_of_improvement(
 ) -> Interval:
     """How often a run of one method beats a run of another on the same task, mean over tasks.
 
-    Args:
-        pairs (sequence of pairs of array-like): for each task, the one's and the other's numbers,
-            one per seed. A tie counts one half.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples; 0 leaves the interval away. Default: 2000.
-
-    Returns:
-        Interval: the ends are NaN where one of them has one seed on a task.
+    ``pairs`` have for each task the one's and the other's numbers, one per seed; a tie counts one
+    half. The ends are NaN as those of :func:`iqm`.
 
     Equation:
         1/T Σ_t 1/(N_t K_t) Σ_i Σ_j (1[x_ti > y_tj] + ½ 1[x_ti = y_tj]); what rliable computes by
@@ -69,17 +55,10 @@ def probability_of_improvement(
 
 
 def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of a band around the mean over seeds.
+    """Ends of a band around the mean over seeds of values [seeds, evaluations].
 
-    Args:
-        values (np.ndarray): one row per seed, one column per evaluation.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples. Default: 2000.
-
-    Returns:
-        tuple of np.ndarray: the percentile bootstrap's 95 % interval from three seeds up; smallest
-        and largest value of two seeds, or of one.
+    From three seeds up it is the percentile bootstrap's 95 % interval; of two seeds, or of one,
+    smallest and largest value.
 
     Examples:
         >>> [end.tolist() for end in mean_band(np.array([[1.0, 2.0], [3.0, 2.0]]))]

@@ -78,15 +78,8 @@ def side_by_side(sides: Mapping[str, Sequence[np.ndarray]]) -> Iterator[np.ndarr
 def write_moving_pictures(
     folder: Path, sides: Mapping[str, Sequence[np.ndarray]], name: str = "episodes"
 ) -> list[Path]:
-    """Write ``name.mp4`` and ``name.webp``, the latter small enough for a page.
-
-    Args:
-        folder (path): where they go; it is made.
-        sides (mapping): see :func:`side_by_side`.
-        name (str): of both files. Default: ``"episodes"``.
-
-    Returns:
-        list: the two files.
+    """Write what :func:`side_by_side` shows into ``name.mp4`` and ``name.webp``, the latter small
+    enough for a page, in a folder that is made; returns both.
     """
     folder.mkdir(parents=True, exist_ok=True)
     video, picture = folder / f"{name}.mp4", folder / f"{name}.webp"
@@ -107,13 +100,8 @@ def _write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
 
 
 def animated_picture(frames: Iterable[np.ndarray], *, quality: int = 50) -> bytes:
-    """Each second frame of the first eight seconds, at most 640 pixels wide, as an endless WebP.
-
-    Args:
-        frames (iterable of arrays): [H, W, 3] of uint8, 25 to a second.
-
-    Keyword Args:
-        quality (int): from 0, the smallest, to 100. Default: 50.
+    """Each second of the frames [H, W, 3] of the first eight seconds, at most 640 pixels wide, as
+    an endless WebP, in a quality from 0, the smallest, to 100.
     """
     with extra("video"):
         from PIL import Image

@@ -72,16 +72,8 @@ def task_picture(
 
     A line is the mean over the seeds of a method, over the frames that all of them reached. Its
     band is the 95 % bootstrap interval from three seeds up, smallest to largest of two. Published
-    curves are grey and dashed, up to the frames that the runs reached.
-
-    Args:
-        runs (sequence of SweepRun): the finished runs of one task and goal.
-        styles (mapping): what :func:`looks` gave.
-        path (path-like): where the PNG goes.
-
-    Keyword Args:
-        budget (int, optional): frames at which the methods are compared, to be marked.
-        repetitions (int): number of bootstrap resamples. Default: 2000.
+    curves are grey and dashed, up to the frames that the runs reached. ``budget`` marks the frames
+    at which methods are compared; ``repetitions`` are bootstrap resamples.
 
     Raises:
         ValueError: if there are no runs.
@@ -148,11 +140,6 @@ def overall_picture(
     path: str | os.PathLike[str],
 ) -> Path:
     """Draw each method's interquartile mean of normalized returns with its interval.
-
-    Args:
-        results (sequence of OverallResult): one per method.
-        styles (mapping): what :func:`looks` gave.
-        path (path-like): where the PNG goes.
 
     Raises:
         ValueError: if there are no results.

@@ -49,21 +49,10 @@ def write_report(
     frames: int | None = None,
     repetitions: int = 2000,
 ) -> tuple[int, int]:
-    """Write report.md and its pictures.
+    """Write report.md and its pictures into a folder; returns how many tasks and methods are in it.
 
-    Args:
-        sweep (SweepResults): the evaluations.
-        folder (path): where to; made if it is not there.
-        arguments (sequence of str): settings that led to this report, to be named in it.
-
-    Keyword Args:
-        control (str): the method against which improvement is measured.
-        frames (int, optional): compare at so many environment frames; ``None``: the most that a
-            task's runs share.
-        repetitions (int): resamples of each bootstrap interval.
-
-    Returns:
-        tuple of int: tasks and methods in it.
+    ``arguments`` are the settings that led to it, to be named in it; the others are those of
+    :func:`~torchrl_etl.analysis.sweep_statistics.compare`.
 
     Raises:
         ValueError: for a control that was not run, or frames that no run reached.

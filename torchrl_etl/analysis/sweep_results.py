@@ -142,9 +142,6 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
     one that stands latest in the file counts; and where rows were replaced, so were those of the
     older attempt at more frames than the newer one reached.
 
-    Args:
-        folder (path-like): the folder with ``results.csv``, see :data:`COLUMNS`.
-
     Raises:
         FileNotFoundError: if the folder or the file is missing.
         ValueError: if the file has no rows, lacks columns, or a line has a number that cannot be

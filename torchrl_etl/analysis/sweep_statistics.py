@@ -102,15 +102,8 @@ def compare(
     """Compare the methods on one task at the same number of frames.
 
     A run counts with its last evaluation up to 1 % past that number: nothing is interpolated.
-
-    Args:
-        runs (sequence of SweepRun): the finished runs of one task and goal.
-        methods (sequence of str): which methods, in which order.
-        control (str): the method against which improvement is measured.
-
-    Keyword Args:
-        frames (int, optional): the budget; the largest common one if None.
-        repetitions (int): number of bootstrap resamples. Default: 2000.
+    Without ``frames`` it is the largest that the runs share. Improvement is over ``control``;
+    ``repetitions`` are bootstrap resamples.
 
     Raises:
         ValueError: if there are no runs, or they are of several tasks.
@@ -190,14 +183,8 @@ def overall(
 ) -> tuple[OverallResult, ...]:
     """Aggregate each method's normalized returns over the tasks that have a scale.
 
-    Args:
-        comparisons (sequence of Comparison): one per task.
-        scales (sequence of Scale or str): for each of them, what :func:`normalize` said.
-        methods (sequence of str): which methods, in which order.
-        control (str): the method against which improvement is measured.
-
-    Keyword Args:
-        repetitions (int): number of bootstrap resamples. Default: 2000.
+    There is one comparison per task, and for each what :func:`normalize` said of its scale; the
+    other arguments are those of :func:`compare`.
     """
     scaled = [
         (comparison, scale)

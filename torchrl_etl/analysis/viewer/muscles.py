@@ -20,24 +20,16 @@ _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _WRAPPED_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
+_LEAST = 0.01  # strength that is worth naming
 # Rest, half and full activation; and the same for what pulls the other way.
 _REST, _HALF, _FULL = np.array([[60, 72, 102], [226, 74, 60], [216, 0, 32]], float)
 _HALF_BACK, _FULL_BACK = np.array([[67, 147, 195], [0, 92, 190]], float)
 
 
-def driven_muscles(
-    decoder: SynergyMap, names: Sequence[str], least: float = 0.01
-) -> list[list[tuple[str, float]]]:
+def driven_muscles(decoder: SynergyMap, names: Sequence[str]) -> list[list[tuple[str, float]]]:
     """Per synergy the muscles that it drives, by name and strength, the strongest first.
 
-    Args:
-        decoder (SynergyMap): the decoder.
-        names (sequence of str): of its n actuators, in action order.
-        least (float): strengths below this are left out.
-
-    Returns:
-        list: per synergy (name, strength) pairs, the strength as
-        :func:`~torchrl_etl.analysis.synergy_effects` has it, in [-1, 1].
+    Strengths are those of :func:`~torchrl_etl.analysis.synergy_effects`, in [-1, 1].
 
     Examples:
         >>> import torch
@@ -50,7 +42,7 @@ def driven_muscles(
     driven = []
     for effects in synergy_effects(decoder).cpu().numpy():
         order = np.argsort(-np.abs(effects), kind="stable")
-        driven.append([(names[i], float(effects[i])) for i in order if abs(effects[i]) >= least])
+        driven.append([(names[i], float(effects[i])) for i in order if abs(effects[i]) >= _LEAST])
     return driven
 
 
