@@ -42,7 +42,7 @@ _OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "d
 
 
 def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50) -> Card:
-    """Evaluate the policy of a run and write it as an entry of the zoo.
+    """Evaluate the policy of a run and write it as an entry of the zoo; returns its card.
 
     The policy that is evaluated is the one that was built again from the card.
 
@@ -53,9 +53,6 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
 
     Keyword Args:
         episodes (int): of the evaluation.
-
-    Returns:
-        Card: what is said of it.
 
     Raises:
         FileNotFoundError: if the run has not begun to learn.

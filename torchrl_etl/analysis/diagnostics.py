@@ -124,9 +124,6 @@ def synergy_warnings(
         authority (Tensor or array): what :func:`control_authority` returned [n].
         kind (str): of the synergy model. Default: ``"gmvae"``.
 
-    Returns:
-        list of str: one sentence per finding, with its numbers and what helps.
-
     Examples:
         >>> synergy_warnings(vaf=0.9, pca_vaf=0.85, authority=[0.5, 0.7])
         []

@@ -70,11 +70,8 @@ def environment_id(task: str, goal: str = "fixed") -> str:
 
 
 def published_curves(env_id: str, metric: str = "return") -> tuple[PublishedCurve, ...]:
-    """Published curves of an environment, in the order of their names.
-
-    Args:
-        env_id (str): the environment's id, see :func:`environment_id`.
-        metric (str): ``"return"``, or ``"success"`` for the share of solved episodes.
+    """Published curves of an environment, see :func:`environment_id`, in the order of their names:
+    of the ``"return"``, or of ``"success"``, the share of solved episodes.
 
     Examples:
         >>> [curve.algorithm for curve in published_curves("myoHandPoseFixed-v0")]

@@ -108,24 +108,14 @@ class DEPController:
     def reset(self, rows: Tensor) -> None:
         """Some bodies begin a new episode: their way to its first lengths is no movement.
 
-        What they have learned (the extremes of the lengths, the latest movements and the bias)
-        stays, as it does in the public code.
-
-        Args:
-            rows (Tensor): which ones: a mask [rows], or their indices.
+        They are told by a mask [rows], or by their indices. What they have learned (the extremes of
+        the lengths, the latest movements and the bias) stays, as it does in the public code.
         """
         self._jumped[rows] = True
 
     @torch.no_grad()
     def step(self, lengths: Tensor) -> Tensor:
-        """Take in the lengths of one time step, adapt, and command.
-
-        Args:
-            lengths (Tensor): muscle lengths [rows, n].
-
-        Returns:
-            Tensor: commands y [rows, n] in [-1, 1].
-        """
+        """Take in the lengths [rows, n] of one time step, adapt, and command y [rows, n]."""
         self._sense(lengths)
         drive = torch.einsum("rij,rj->ri", self.weights(), self.sensed)
         drive = drive / (drive.norm(dim=-1, keepdim=True) + _TINY)

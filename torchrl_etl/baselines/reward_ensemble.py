@@ -16,16 +16,9 @@ __all__ = ["RewardEnsemble", "diversity_scale"]
 
 
 def diversity_scale(predictions: Tensor, maximum: float = 10.0) -> Tensor:
-    r"""EME's scaling factor: how much an ensemble disagrees on the reward, kept in ``[1, M]``.
+    r"""EME's factor ``[*, 1]``: how much predictions ``[*, K]`` of a reward differ, in ``[1, M]``.
 
     .. math:: \min(\max(\mathrm{Var}_k\, \hat r_k(s, a),\, 1),\, M)
-
-    Args:
-        predictions (Tensor): what each member predicts, ``[*, K]``.
-        maximum (float, optional): M, at least 1. Defaults to ``10.0``.
-
-    Returns:
-        Tensor: factors, ``[*, 1]``.
 
     Deviates: which variance is not said; this is the population's (divided by K).
 

@@ -21,11 +21,7 @@ def flat_action(env: gym.Env) -> gym.Env:
 
 
 def check_action_space(space: spaces.Space, task: str) -> None:
-    """Refuses actions in which no synergy can be learned.
-
-    Args:
-        space (gymnasium.spaces.Space): of the actions, any shape.
-        task (str): its name, for the message.
+    """Refuses actions, of any shape, in which no synergy can be learned.
 
     Raises:
         ValueError: unless the space is a box of real numbers, with bounds below 1e6 in magnitude

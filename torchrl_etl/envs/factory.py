@@ -86,9 +86,6 @@ def make_env(
         env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
             ``dm_control.suite.load``.
 
-    Returns:
-        EnvBase: the environment.
-
     Keys:
         - ``observation`` [O], float32, flat. DMControl's parts are joined in alphabetical order.
         - ``action`` [n], float32, flat, within the bounds that the simulator declares: [-1, 1] for

@@ -71,11 +71,8 @@ class SideBySide:
         self._all = learners[0].over(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-        """Every learner learns from its own :meth:`SACLearner.inputs` [k], one after the other.
-
-        Returns:
-            list of TensorDictBase: the scalars [k] of each.
-        """
+        """Every learner learns from its own :meth:`SACLearner.inputs` [k], one after the other;
+        returns the scalars [k] of each."""
         self._take()
         stacked = torch.stack(list(inputs), 1)
         if not self._checked:

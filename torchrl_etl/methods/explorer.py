@@ -99,8 +99,7 @@ class Explorer:
     def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyDecoder]:
         """Train the synergy model to the end; returns the decoder for stage 2.
 
-        Keyword Args:
-            on_update (callable): called before every few updates; may raise to stop.
+        ``on_update`` is called before every few updates and may raise to stop.
         """
         torch.manual_seed(self.seed)  # the same whether or not the run was resumed
         if self.term is None:
@@ -139,12 +138,7 @@ def make_exploration(context: Context) -> Exploration:
 
 
 def make_synergy_model(context: Context, num_synergies: int | None = None) -> SynergyModel:
-    """The synergy model that the configuration names.
-
-    Args:
-        context (Context): of the run.
-        num_synergies (int, optional): d. Default: the configured one.
-    """
+    """The synergy model that the configuration names, with its d or another."""
     options = context.options("synergies")
     options.pop("bundle", None)
     number = context.config.num_synergies if num_synergies is None else num_synergies

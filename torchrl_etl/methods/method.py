@@ -78,10 +78,7 @@ class Method(ABC):
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         """Find out what :meth:`stage` needs and leave it in the run folder.
 
-        What is there already is not done again.
-
-        Returns:
-            dict: facts for ``summary.json``.
+        What is there already is not done again. Returns facts for ``summary.json``.
         """
         yield from ()
         return {}

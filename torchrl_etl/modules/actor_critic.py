@@ -173,12 +173,8 @@ def actor_with(
 ) -> ProbabilisticActor:
     """An actor that samples from a distribution within the bounds of ``action_spec``.
 
-    Args:
-        distribution (type): built from the parameters, ``low``, ``high`` and ``kwargs``.
-        network (nn.Module): from the inputs to the parameters.
-        inputs, parameters (iterables of keys): what the network reads and writes.
-        action_spec (TensorSpec): one unbatched bounded leaf.
-        out_key (NestedKey): where the sample goes.
+    The distribution is built from the parameters, which the network makes of the inputs, ``low``,
+    ``high`` and ``kwargs``.
     """
     bounds = {"low": action_spec.space.low, "high": action_spec.space.high}
     return ProbabilisticActor(

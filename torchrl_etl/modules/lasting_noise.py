@@ -24,9 +24,6 @@ class HeldNormal:
         longest (int): most steps.
         exponent (float): above 0; the larger, the shorter. Default: 2.
 
-    Raises:
-        ValueError: if exponent or longest are not positive.
-
     Examples:
         >>> held = HeldNormal(longest=16)
         >>> held(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
@@ -41,12 +38,8 @@ class HeldNormal:
         self._left: Tensor | None = None
 
     def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
-        """The noise of this step.
-
-        Args:
-            like (Tensor): of the shape [*, n] and dtype that it shall have.
-            begins (Tensor): where an episode begins, bool [*].
-        """
+        """The noise [*, n] of this step, of the dtype of ``like``; ``begins`` [*] says where an
+        episode begins."""
         if self._noise is None or self._noise.shape != like.shape:
             self._noise = torch.zeros_like(like)
             self._left = torch.zeros_like(begins, dtype=torch.long)
@@ -70,9 +63,6 @@ class PinkNormal:
 
     Args:
         longest (int): time constant of the slowest process in steps, brought down to a power of 2.
-
-    Raises:
-        ValueError: if longest is not positive.
 
     Examples:
         >>> pink = PinkNormal(longest=64)

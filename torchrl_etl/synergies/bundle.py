@@ -71,9 +71,6 @@ def save_bundle(
         kind (str, optional): kind of synergies. Default: ``"affine"`` for a decoder without hidden
             layers, else ``"gmvae"``.
 
-    Returns:
-        Path: the folder.
-
     Raises:
         BundleError: if the names do not fit the decoder, a fact cannot be written as JSON, or
             ``path`` holds anything but a bundle.
@@ -210,9 +207,6 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         source (path-like): the bundle's folder, or a run folder.
         target (path-like): a folder; a bundle that is there already is replaced.
 
-    Returns:
-        Path: the folder.
-
     Raises:
         BundleError: if there is no bundle at ``source``, it is damaged, or ``target`` holds
             anything but a bundle.
@@ -234,13 +228,7 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
 
 
 def bundle_files(path: str | os.PathLike[str]) -> dict[str, bytes]:
-    """The files of a whole bundle, to be put somewhere else.
-
-    Args:
-        path (path-like): the bundle's folder, or a run folder.
-
-    Returns:
-        dict: contents by name.
+    """The files of a whole bundle by name, to be put somewhere else.
 
     Raises:
         BundleError: if there is no bundle, or it is damaged.

@@ -69,15 +69,7 @@ def independent_components(
     """The mean [n] of actions [N, n], and the basis [count, n] of coefficients of unit variance.
 
     Principal components first, among which independent ones are then searched for; those along
-    which the actions do not vary stay as they are.
-
-    Args:
-        actions (array): [N, n], in double precision.
-        count (int): of components, at most n.
-
-    Keyword Args:
-        seed (int): of the search. Default: 0.
-        max_iter (int): of its iterations at most. Default: 1000.
+    which the actions do not vary stay as they are. The actions are in double precision.
     """
     pca = principal_components(actions, count, random_state=seed)
     basis, mean = pca.components_.copy(), pca.mean_

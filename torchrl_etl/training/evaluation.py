@@ -97,9 +97,6 @@ def evaluate(
         solved_steps (int, optional): on how many steps an episode must be solved to count, such as
             :attr:`Task.solved_steps <torchrl_etl.envs.Task>`. Default: on its last.
         seed (int): first seed.
-
-    Returns:
-        Evaluation: solved is None where the environment does not define it.
     """
     returns, lengths, solved, successes = [], [], [], []
     with as_evaluated(env):
@@ -161,9 +158,6 @@ def evaluate_task(
 
 def longest_episode(task: Mapping[str, Any]) -> int:
     """Steps of the simulator after which an episode ends; 1,000 where the task does not say.
-
-    Args:
-        task (mapping): see :func:`evaluate_task`.
 
     Examples:
         >>> longest_episode({"name": "overactuated"})

@@ -137,15 +137,8 @@ class EpisodeRecorder:
     def record(
         self, policy: TensorDictModuleBase, episodes: int, *, seed: int = EVALUATION_SEED
     ) -> list[np.ndarray]:
-        """Frames [T, H, W, 3] of each of the first evaluation episodes, without noise.
-
-        Args:
-            policy (TensorDictModuleBase): the policy.
-            episodes (int): number of episodes.
-
-        Keyword Args:
-            seed (int): of the first; see :func:`~torchrl_etl.training.evaluate`.
-        """
+        """Frames [T, H, W, 3] of each of the first evaluation episodes, without noise; ``seed`` is
+        that of the first, see :func:`~torchrl_etl.training.evaluate`."""
         with as_evaluated(self._env):
             return [self._episode(policy, seed + number) for number in range(episodes)]
 

@@ -93,15 +93,7 @@ def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
 def check_network(name: str, network: object, reads: Sequence[str], writes: str) -> None:
     """Refuse a network that has no keys, or more or fewer than a transform hands it.
 
-    Args:
-        name (str): what an error calls it.
-        network (TensorDictModuleBase): must read as many keys, and write one.
-        reads (sequence of str): what these are, in words.
-        writes (str): what that is, in words.
-
-    Raises:
-        TypeError: if it has no keys.
-        ValueError: if it has others.
+    In an error its name is ``name``; ``reads`` and ``writes`` say in words what it must.
     """
     if not (hasattr(network, "in_keys") and hasattr(network, "out_keys")):
         raise TypeError(

@@ -115,9 +115,6 @@ def load(
         env (EnvBase, optional): an environment to act in. Default: one of the entry's task.
         device (torch.device, optional): of the policy and of that environment. Default: the CPU.
 
-    Returns:
-        policy and environment.
-
     Raises:
         ZooError: if there is no such entry, it is damaged, or its policy is not one of the
             environment's sizes, bounds and muscles.
@@ -226,9 +223,6 @@ def save_entry(
 
     Keyword Args:
         bundle (path-like, optional): a synergy bundle or a run folder that holds one.
-
-    Returns:
-        Path: the folder.
 
     Raises:
         ZooError: if the folder holds anything but an entry, or the card does not describe the

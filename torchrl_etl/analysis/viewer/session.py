@@ -201,15 +201,10 @@ class Session:
     # What time does ----------------------------------------------------------------------------
 
     def advance(self, seconds: float, patience: float = 0.05) -> int:
-        """Let so much time pass: nothing happens in it unless the session plays or settles.
+        """Let so much wall time pass; returns the number of steps in it.
 
-        Args:
-            seconds (float): wall time since the last call.
-            patience (float): wall time after which a simulator that is too slow for its speed
-                falls behind, so that the page stays alive.
-
-        Returns:
-            int: number of steps.
+        Nothing happens unless the session plays or settles. After ``patience`` seconds a simulator
+        that is too slow for its speed falls behind, so that the page stays alive.
         """
         if not self._moving:
             self._budget = 0.0
