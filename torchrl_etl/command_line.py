@@ -49,14 +49,9 @@ def check_overrides(
     plus in front of a key is no way around: nothing would read what it adds, but in the sections
     that are handed on to another library.
 
-    Args:
-        config (path): the primary YAML file; folders beside it are groups.
-        arguments (list of str): the command line without the program.
-        usage (str): what the help begins with.
-
-    Keyword Args:
-        short (sequence of str): ways to write a setting that the recipe has translated already, to
-            be suggested like the rest.
+    ``config`` is the primary YAML file, beside which folders are groups, and ``usage`` what the
+    help begins with; ``short`` are ways to write a setting that the recipe has translated already,
+    to be suggested like the rest.
     """
     text = config.read_text(encoding="utf-8")
     if {"-h", "--help"} & set(arguments):
@@ -102,11 +97,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
     ``synergies.kind=KIND``, ``exploration.kind=KIND`` and ``method.kind=KIND`` brings that kind's
     other settings unless it is a class of one's own, ``module:Class``, and the presets that hold
     today's defaults are no preset: they are left out, as ``null`` is, which Hydra does not take for
-    a group.
-
-    Args:
-        arguments (sequence of str): the command line without the program.
-        groups (path): the folder of the configuration's groups.
+    a group. ``groups`` is the folder of the configuration's groups.
 
     Raises:
         ValueError: for a setting that has another name now, which it tells.

@@ -120,12 +120,8 @@ def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDi
 
 
 def command_of(config: DictConfig, compose: Compose, name: str) -> str:
-    """The command whose configuration is this one, but for what concerns place and display.
-
-    Args:
-        config (DictConfig): of a run.
-        compose (callable): a configuration from Hydra's overrides.
-        name (str): of the entry, whose synergies stand for those that the run was given.
+    """The command whose configuration is this one, but for what concerns place and display; the
+    synergies of the entry of this name stand for those that the run was given.
     """
     chosen: list[str] = []
     unread = set()

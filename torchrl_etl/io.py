@@ -29,12 +29,7 @@ Content = TypeVar("Content", dict[str, Any], list[Any])
 
 
 def read_bytes(path: Path, error: type[Exception], cure: str) -> bytes:
-    """The content of a file.
-
-    Args:
-        path (Path): the file.
-        error (type of exception): what to raise if there is none, or it cannot be read.
-        cure (str): the end of its sentence: what helps.
+    """The content of a file; if it cannot be read, an ``error`` whose sentence ends in the cure.
 
     Examples:
         >>> read_bytes(Path("card.json"), ValueError, "copy it again")
@@ -69,14 +64,7 @@ def own_folder(
 ) -> Path:
     """A folder to be replaced, which may hold files of these names and nothing else.
 
-    Args:
-        path (path-like): the folder, there already or not.
-        names (collection of str): what it may hold.
-        what (str): what will be saved there, in words.
-        error (type): what to raise.
-
-    Raises:
-        error: if there is a file, or a folder that holds anything else.
+    Where it does, or is a file, the ``error`` says in words ``what`` was to be saved there.
 
     Examples:
         >>> own_folder("recipes", ["card.json"], "an entry", ValueError)
@@ -103,11 +91,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     The files are written to a hidden sibling and flushed to disk. No call that works everywhere
     exchanges two folders, so the old one first steps aside under a hidden name; until the new one
     has its place, :func:`surviving_folder` finds the old one there. One process at a time may
-    write to a folder.
-
-    Args:
-        folder (Path): where the files belong; parents are created.
-        files (mapping of str to bytes): names and contents.
+    write to a folder, whose parents are created.
 
     Examples:
         >>> from tempfile import TemporaryDirectory

@@ -19,14 +19,8 @@ T = TypeVar("T")
 def check_imported(name: object, source: str, error: type[ValueError], remedy: str) -> None:
     """Refuse a name out of a file that holds no code if a module would be imported for it.
 
-    Args:
-        name (str): ``"module:name"``, or a name for which nothing is imported.
-        source (str): what has this name, and in which file.
-        error (type): the exception to raise.
-        remedy (str): what a person can do who trusts the module.
-
-    Raises:
-        ValueError: of the given type, if the module has not been imported yet.
+    The error, of the given type, says what has this name, ``source``, and what a person can do who
+    trusts the module, ``remedy``.
 
     Examples:
         >>> check_imported("fractions:Fraction", "The task of my_file", ValueError, "import it")
@@ -44,12 +38,8 @@ def check_imported(name: object, source: str, error: type[ValueError], remedy: s
 
 
 def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T]:
-    """The class of a kind: one of ``kinds``, or of one's own where it is ``"module:Class"``.
-
-    Args:
-        kind (str): the name.
-        kinds (mapping): classes by name.
-        base (type): what a class of one's own must be derived from.
+    """The class of a kind: one of ``kinds``, or of one's own where it is ``"module:Class"``, which
+    must be derived from ``base``.
 
     Raises:
         ImportError: if there is no such module.
@@ -83,11 +73,8 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
 def import_own(module: str, usage: str) -> ModuleType:
     """Import a module that is installed or in the current folder.
 
-    The current folder is looked into last; a script in another folder would not see it.
-
-    Args:
-        module (str): its name.
-        usage (str): what it is for, and how to name it.
+    The current folder is looked into last; a script in another folder would not see it. ``usage``
+    says what it is for, and how to name it.
 
     Raises:
         ImportError: if there is no such module. What the module itself fails to import is for its

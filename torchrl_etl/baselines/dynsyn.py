@@ -173,16 +173,10 @@ def picked(values: Tensor, index: Tensor) -> Tensor:
 class DynSynNetwork(nn.Module):
     """What a DynSyn actor computes: the parameters of :class:`GroupedTanhNormal`.
 
-    The groups are among them: actors that are updated side by side have each its own.
+    The groups are among them: actors that are updated side by side have each its own. The layers
+    have k + n outputs.
 
     Equation: amplitude(t) = clip(slope (t - start), 0, ceiling), with t in frames.
-
-    Args:
-        layers (nn.Sequential): with k + n outputs.
-        groups (MuscleGroups): of the n muscles.
-
-    Keyword Args:
-        slope, start, ceiling (float): see the equation.
     """
 
     def __init__(

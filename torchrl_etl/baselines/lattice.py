@@ -156,17 +156,8 @@ class StateDependentSpread(nn.Module):
     """S of Lattice with state-dependent exploration: a parameter log S [H, H + n].
 
     Equation: v_x = α² x² S_x², v_a = x² S_a² + std_reg², with S = expln(clip(log S) − ½ log H) and
-    expln(y) = exp(y) for y ≤ 0, 1 + log(1 + y) above.
-
-    Args:
-        features (int): number H of features.
-        action_dim (int): number n of actuators.
-
-    Keyword Args:
-        init (float): log S at the start.
-        bounds (tuple of float): least and greatest log S.
-        alpha (float): α.
-        std_reg (float): keeps the covariance positive where all features are zero.
+    expln(y) = exp(y) for y ≤ 0, 1 + log(1 + y) above. At the start log S is ``init``; it is clipped
+    to ``bounds``. ``std_reg`` keeps the covariance positive where all features are zero.
 
     Examples:
         >>> import torch
