@@ -27,7 +27,6 @@ from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap
 from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
 
 __all__ = [
-    "check_rates",
     "drawn_in",
     "entropy_target",
     "episode_numbers",
@@ -38,14 +37,6 @@ __all__ = [
     "make_return_scale",
     "parameter_groups",
 ]
-
-
-def check_rates(lr: float, lr_end: float, tau: float, ema_decay: float) -> None:
-    """Refuse what no learning rate and no EMA can be."""
-    check_real("(0, inf)", lr=lr)
-    check_real("[0, 1]", lr_end=lr_end)
-    check_real("(0, 1]", tau=tau)
-    check_real("[0, 1)", ema_decay=ema_decay)
 
 
 def make_loss(

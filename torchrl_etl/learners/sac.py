@@ -19,13 +19,12 @@ from torch.func import functional_call
 from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_flag
+from torchrl_etl.checks import check_flag, check_real
 from torchrl_etl.draws import redrawn
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import Objective
 from torchrl_etl.learners.parts import (
-    check_rates,
     drawn_in,
     episode_numbers,
     from_observation,
@@ -132,7 +131,10 @@ class SACLearner:
         on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
     ) -> None:
-        check_rates(lr, lr_end, tau, ema_decay)
+        check_real("(0, inf)", lr=lr)
+        check_real("[0, 1]", lr_end=lr_end)
+        check_real("(0, 1]", tau=tau)
+        check_real("[0, 1)", ema_decay=ema_decay)
         check_flag(unit_rows=unit_rows)
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
