@@ -100,20 +100,19 @@ def _stored(path: Path) -> DictConfig:
         )
     try:
         config = OmegaConf.load(path)
-        fault = None
+        fault = _lacks(config)
     except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
-        config, fault = None, " ".join(str(error).split())
-    fault = fault or _lacks(config)
-    if fault is None and "learner" in config.method:  # nothing but its name has changed
-        config.method.kind = config.method.pop("learner")
-    if fault is None and (old := [k for k in RENAMED if OmegaConf.select(config, k) is not None]):
-        raise ValueError(
-            f"{path} is of a release whose settings had other names ({old[0]}, now "
-            f"{RENAMED[old[0]]}); go on with that release, or start a new run."
-        )
+        fault = " ".join(str(error).split())
     if fault is not None:
         raise ValueError(
             f"{path} is damaged ({fault}); copy it from a backup of the run, or start a new run."
+        )
+    if "learner" in config.method:  # nothing but its name has changed
+        config.method.kind = config.method.pop("learner")
+    if old := [key for key in RENAMED if OmegaConf.select(config, key) is not None]:
+        raise ValueError(
+            f"{path} is of a release whose settings had other names ({old[0]}, now "
+            f"{RENAMED[old[0]]}); go on with that release, or start a new run."
         )
     return config
 
