@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,30 +23,14 @@ class BufferAdapter(CheckpointAdapter):
 
     adapter_id = "torchrl_etl.buffer"
 
-    def save(
-        self,
-        component: ReplayBuffer,
-        path: Path,
-        *,
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def save(self, component: ReplayBuffer, path: Path, **_: Any) -> None:
         path.mkdir(parents=True)
         rows = component.storage[:] if len(component) else TensorDict({}, [0])
         rows.cpu().memmap(str(path / "rows"), copy_existing=True)
         position = {"cursor": component.writer._cursor, "rows": len(component)}
         (path / "position.json").write_text(json.dumps(position))
 
-    def load(
-        self,
-        component: ReplayBuffer,
-        path: Path,
-        *,
-        map_location: Any,
-        tensor_load_kwargs: Mapping[str, Any],
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
+    def load(self, component: ReplayBuffer, path: Path, **_: Any) -> None:
         position = json.loads((path / "position.json").read_text())
         component.empty()
         if position["rows"]:
