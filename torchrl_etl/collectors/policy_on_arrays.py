@@ -29,11 +29,8 @@ class PolicyOnArrays:
     A sequence of plain modules is traced into one graph: the same operations on the same weights
     without Python and TensorDict in between, which the physics of each step drives out of the
     processor's caches. (On batches as small as these ``torch.compile`` and AOTInductor are no
-    faster, and take 10 to 35 s to start.) Any other policy is called with a tensordict.
-
-    Args:
-        policy (TensorDictModule): the policy. Its weights may be updated in place at any time;
-            where they were replaced by others, :meth:`refresh` finds out.
+    faster, and take 10 to 35 s to start.) Any other policy is called with a tensordict. Its weights
+    may be updated in place at any time; where others replaced them, :meth:`refresh` finds out.
 
     Examples:
         >>> import numpy as np

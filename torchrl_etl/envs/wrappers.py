@@ -88,14 +88,8 @@ class RepeatedAction(gym.Wrapper):
 class FiniteGuard(gym.Wrapper):
     """Speaks float32, and stops at the first action, observation or reward that is not finite.
 
-    Args:
-        env (gym.Env): an environment with an array as observation.
-        name (str): the task's name, for the message.
-        faults (tuple of exception types): exceptions by which the simulator itself reports that it
-            diverged.
-
-    Raises:
-        SimulationError: saying which entries, in which episode and at which step.
+    A :class:`SimulationError` says which entries, in which episode and at which step; so it does of
+    ``faults``, by which the simulator itself reports that it diverged.
     """
 
     def __init__(self, env: gym.Env, name: str, faults: tuple[type[Exception], ...] = ()):

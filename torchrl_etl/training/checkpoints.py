@@ -33,12 +33,7 @@ class Checkpoints(CheckpointRotation):
     its files to disk nor notices a damaged one. Here every file is flushed and its SHA-256 goes
     into ``seal.json``, before the folder gets its name: whatever has the name of a checkpoint was
     whole once, and one whose seal is missing or does not match is passed over for the one before.
-
-    Args:
-        directory (path): where the checkpoints of one stage live.
-
-    Keyword Args:
-        keep_last (int): checkpoints to keep; 2 or more, so that one is always whole.
+    So that one is always whole, two or more are kept.
     """
 
     def save(self, checkpoint: Checkpoint, *, step: int, **kwargs: Any) -> Path:

@@ -31,15 +31,10 @@ _PACKAGES = (
 
 
 class RunFolder:
-    """Paths of a run and the writers of its small files.
+    """Paths of a run and the writers of its small files; :meth:`open` is the first to write.
 
-    Args:
-        path (path): the folder; nothing is written before :meth:`open`.
-        config (DictConfig): resolved configuration; its ``log`` names the loggers.
-
-    Keyword Args:
-        unique (bool): let :meth:`open` add a number to the name if another run was quicker to take
-            it. Default: ``False``.
+    The configuration's ``log`` names the loggers. Where another run was quicker to take the name of
+    the folder, ``unique`` lets a number be added to it.
     """
 
     def __init__(self, path: Path, config: DictConfig, *, unique: bool = False) -> None:

@@ -39,12 +39,7 @@ class Body:
     tasks move through the model; it draws all tendons in one colour. So its conversion of meshes is
     used here, and not its scene.
 
-    Args:
-        server (viser.ViserServer): whose scene is filled; it is emptied first.
-        model, data: of :func:`~torchrl_etl.envs.mujoco_state`.
-
-    Keyword Args:
-        follow (bool): keep the body in the middle, for one that walks away. Default: ``False``.
+    The server's scene is emptied first. ``follow`` keeps a body in the middle that walks away.
     """
 
     def __init__(
