@@ -24,6 +24,9 @@ class HeldNormal:
         longest (int): most steps.
         exponent (float): above 0; the larger, the shorter. Default: 2.
 
+    Raises:
+        ValueError: if exponent or longest are not positive.
+
     Examples:
         >>> held = HeldNormal(longest=16)
         >>> held(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
@@ -63,6 +66,9 @@ class PinkNormal:
 
     Args:
         longest (int): time constant of the slowest process in steps, brought down to a power of 2.
+
+    Raises:
+        ValueError: if longest is not positive.
 
     Examples:
         >>> pink = PinkNormal(longest=64)
