@@ -154,6 +154,12 @@ def keyword_inputs() -> TensorDictModule:
     return TensorDictModule(Value(), names, ["state_action_value"])
 
 
+def hooked() -> TensorDictModule:
+    critic = TensorDictModule(Value(), ["observation", "action"], ["state_action_value"])
+    critic.register_forward_hook(lambda _, __, out: out.apply(lambda value: 2 * value))
+    return critic
+
+
 def composite_actor(**parts: Any) -> ProbabilisticActor:
     """Of the parts "left" [*, 2] and "right" [*, 3] of an action."""
 
@@ -196,7 +202,7 @@ def assert_same_numbers(actor: Any, critic: Any, data: TensorDict) -> None:
     torch.testing.assert_close(our_gradients, their_gradients)
 
 
-@pytest.mark.parametrize("make", [sequence, two_outputs, keyword_inputs])
+@pytest.mark.parametrize("make", [sequence, two_outputs, keyword_inputs, hooked])
 def test_critics_of_any_make_give_the_numbers_of_torchrls_loss(make: Any) -> None:
     actor = make_loss().actor_network
     torch.manual_seed(SEED)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Distribution
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,6 +21,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.functional import categorical_cross_entropy, categorical_mean, project_categorical
+from torchrl_etl.modules.calls import calls_module_only
 from torchrl_etl.objectives.checks import check_parts
 
 __all__ = ["LeanSACLoss", "call"]
@@ -291,24 +292,9 @@ def call(
     out_key: NestedKey,
 ) -> Tensor:
     """An output of a network, computed with other weights than its own; inputs stay as they are."""
-    if not calls_module_alone(network):
+    if len(network.out_keys) > 1 or not calls_module_only(network):
         inputs = inputs.select(*network.in_keys, strict=False).copy()
         return functional_call(network, weights, (inputs,), tie_weights=False).get(out_key)
     own = {name.removeprefix("module."): weight for name, weight in weights.items()}
     tensors = tuple(inputs.get(key) for key in network.in_keys)
     return functional_call(network.module, own, tensors, tie_weights=False)
-
-
-def calls_module_alone(network: TensorDictModule) -> bool:
-    """Whether a network is one module from tensors by position to one tensor.
-
-    Its module can then be called without the tensordict around it, at a fraction of the time.
-    """
-    return (
-        type(network).forward is TensorDictModule.forward
-        and isinstance(network.module, nn.Module)
-        and network._kwargs is None  # names of inputs by keyword
-        and network.method is None
-        and not network.method_kwargs
-        and len(network.out_keys) == 1
-    )
