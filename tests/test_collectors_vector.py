@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import pytest
@@ -19,6 +20,7 @@ from torchrl.envs import (
     set_exploration_type,
 )
 
+from tests.frozen_by_a_graph import CHANGES, MAKERS
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import make_env
@@ -55,13 +57,24 @@ def parts(name: str, mode: str, num_envs: int = 3, **kwargs):
     ), actor
 
 
-def batches(collector_class, make, policy, count: int = 3, frames: int = 96, **kwargs):
+def tracked() -> TransformedEnv:
+    return TransformedEnv(
+        make_env("overactuated", num_envs=3, seed=0), Compose(RewardSum(), InitTracker())
+    )
+
+
+def batches(
+    collector_class, make, policy, count: int = 3, frames: int = 96, change=lambda _: None, **kwargs
+):
     collector = collector_class(make, policy, frames_per_batch=frames, total_frames=-1, **kwargs)
     collector.set_seed(7)
     torch.manual_seed(7)
     collector.reset()
     iterator = iter(collector)
-    found = [next(iterator).clone() for _ in range(count)]
+    found = []
+    for _ in range(count):
+        found.append(next(iterator).clone())
+        change(policy)
     collector.shutdown()
     return found
 
@@ -101,11 +114,6 @@ def test_real_simulators_too(name):
 def test_held_noise_is_the_same_under_both_and_begins_anew_with_every_episode():
     _, policy = parts("overactuated", "policy")
 
-    def tracked():
-        return TransformedEnv(
-            make_env("overactuated", num_envs=3), Compose(RewardSum(), InitTracker())
-        )
-
     held = TensorDictSequential(HeldNoise(policy[0]), policy[1])
     ours = batches(VectorCollector, tracked, held)
     held = TensorDictSequential(HeldNoise(policy[0]), policy[1])
@@ -125,6 +133,55 @@ def test_resets_of_single_environments_keep_the_others():
     ours = batches(VectorCollector, make, policy, frames=24)
     assert_same(ours, batches(Collector, make, policy, frames=24, **PLAIN))
     assert ours[0]["next", "done"].sum(1).flatten().tolist() == [4, 2, 2]  # of 2, 3, 4 steps
+
+
+def both_ways(make_policy, change=lambda _: None):
+    """Batches of VectorCollector and of Collector, from a policy each."""
+    found = []
+    for kind, options in ((VectorCollector, {}), (Collector, PLAIN)):
+        torch.manual_seed(0)
+        found.append(batches(kind, tracked, make_policy(), change=change, **options))
+    return found
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_policy_of_which_a_graph_would_miss_something_acts_as_under_torchrl(name):
+    assert_same(*both_ways(MAKERS[name]))
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_whatever_is_changed_between_batches_shows_in_the_next(name):
+    ours, theirs = both_ways(*CHANGES[name])
+    assert_same(ours, theirs)
+    assert not torch.equal(ours[0]["action"], ours[1]["action"])
+
+
+def test_without_a_policy_actions_are_random_as_under_torchrl():
+    ours, theirs = both_ways(lambda: None)
+    assert_same(ours, theirs)
+    assert ours[0]["action"].std() > 0.3
+
+
+@pytest.mark.parametrize("mode", ["explore", "policy", "transform"])
+def test_policies_of_the_package_are_traced_once_and_without_a_word(mode):
+    make, policy = parts("overactuated", mode)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        collector = VectorCollector(make, policy, frames_per_batch=12, total_frames=-1)
+    graphs = set()
+    for _, _ in zip(range(3), collector, strict=False):
+        graphs.add(collector._policy_on_arrays._graph)
+        with torch.no_grad():
+            for weight in policy.parameters():
+                weight.mul_(0.9)
+        policy.train(False).train(True)
+    assert len(graphs) == 1 and None not in graphs
+    collector.shutdown()
+
+
+def test_what_keeps_a_policy_from_being_traced_is_told():
+    with pytest.warns(UserWarning, match=r"a graph may miss what Odd does \(hooks, branches"):
+        VectorCollector(tracked, MAKERS["Python in forward"](), frames_per_batch=12).shutdown()
 
 
 def test_a_policy_that_is_not_a_plain_sequence_is_called_as_it_is():

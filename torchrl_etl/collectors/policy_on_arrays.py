@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from operator import is_not
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
-    TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
 )
@@ -18,19 +18,35 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import exploration_type
 
+from torchrl_etl.modules.calls import calls_module_only
+
 __all__ = ["Arrays", "PolicyOnArrays"]
 
 Arrays = dict[NestedKey, np.ndarray]
+
+# Whose modules do the same to whatever they are given, but for what _constants has.
+_OURS = "torchrl_etl."
+_THEIRS = ("tensordict.nn.", "torchrl.modules.models.models", "torchrl.modules.tensordict_module.")
+_KNOWN = (_OURS, "torch.nn.", *_THEIRS)
+_KNOWN_DISTRIBUTIONS = (_OURS, "torch.distributions.", "torchrl.modules.distributions.")
 
 
 class PolicyOnArrays:
     """Calls a policy with arrays by key, and returns what it writes as arrays by key.
 
-    A sequence of plain modules is traced into one graph: the same operations on the same weights
-    without Python and TensorDict in between, which the physics of each step drives out of the
-    processor's caches. (On batches as small as these ``torch.compile`` and AOTInductor are no
-    faster, and take 10 to 35 s to start.) Any other policy is called with a tensordict. Its weights
-    may be updated in place at any time; where others replaced them, :meth:`refresh` finds out.
+    A policy whose modules are all of ``torch.nn``, TensorDict, TorchRL or this package, without
+    hooks, is traced into one graph: the same operations on the same weights without Python and
+    TensorDict in between, which the physics of each step drives out of the processor's caches. (On
+    batches as small as these ``torch.compile`` and AOTInductor are no faster, and take 10 to 35 s
+    to start.)
+
+    In a module of another's a graph would freeze branches, counts and whatever else is Python. A
+    policy with such a one is called as it is, with a tensordict of all arrays, and everything that
+    is in it afterwards is returned, so that it finds it again if it gets it back.
+
+    Args:
+        policy (callable): the policy. Its weights may be updated in place at any time; where
+            anything else in it was changed, :meth:`refresh` finds out.
 
     Examples:
         >>> import numpy as np
@@ -40,81 +56,79 @@ class PolicyOnArrays:
         >>> written = policy({"observation": np.zeros((5, 3), np.float32)})
         >>> {key: value.shape for key, value in written.items()}
         {'loc': (5, 2), 'scale': (5, 2), 'action': (5, 2)}
+
+    Attributes:
+        foreign (list of types): other classes than this package's that prevent a graph.
     """
 
-    def __init__(self, policy: TensorDictModuleBase) -> None:
+    foreign: list[type]
+
+    def __init__(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
         self._policy = policy
-        self._in_keys, self._out_keys = list(policy.in_keys), list(policy.out_keys)
-        leaves = list(_leaves(policy))
-        is_plain = all(map(_does_no_more_than_its_keys, leaves))
-        self._sequence = _Sequence(leaves, self._in_keys, self._out_keys) if is_plain else None
-        self._graph: Callable[..., tuple[Tensor, ...]] | None = None
-        self._traced_with: tuple[object, ...] = ()
+        self._constants: list[object] = []
         self._shape: torch.Size | None = None
+        self.refresh()
 
     def refresh(self) -> None:
-        """Look for other weights, or another exploration type, than the graph was traced with.
+        """Look for anything else in the policy than what the graph was traced with.
 
         It walks through the whole policy, so a rollout does it once and not at every step.
         """
-        if self._identity() != self._traced_with:
-            self._graph = None
+        found = list(_constants(self._policy))
+        if len(found) != len(self._constants) or any(map(is_not, found, self._constants)):
+            self._constants = found  # held, so that nothing else gets the id of one of these
+            opaque = {type(module) for module in _opaque(self._policy)}
+            self.foreign = [kind for kind in opaque if not kind.__module__.startswith(_OURS)]
+            self._sequence = None if opaque else _Sequence(self._policy)
+            self._graph: Callable[..., tuple[Tensor, ...]] | None = None
 
     @torch.no_grad()
     def __call__(self, inputs: Arrays, device: torch.device | None = None) -> Arrays:
-        tensors = [torch.from_numpy(inputs[key]) for key in self._in_keys]
+        # What a policy of another's reads beside its keys, nobody knows.
+        keys = inputs if self.foreign else self._policy.in_keys
+        tensors = [torch.from_numpy(inputs[key]) for key in keys]
         if device is not None:
             tensors = [tensor.to(device) for tensor in tensors]
         if self._sequence is None:
-            named = dict(zip(self._in_keys, tensors, strict=True))
-            entries = TensorDict(named, tensors[0].shape[:1])
-            written = self._policy(entries)
-            outputs = [written[key] for key in self._out_keys]
+            root = TensorDict(dict(zip(keys, tensors, strict=True)), len(tensors[0]), device=device)
+            written = root.update(self._policy(root)).items(True, True)
         else:
             if self._graph is None or tensors[0].shape != self._shape:
                 self._graph = self._trace(self._sequence, tensors)
-            outputs = self._graph(*tensors)
-        arrays = (output.cpu().numpy() for output in outputs)
-        return dict(zip(self._out_keys, arrays, strict=True))
+            written = zip(self._sequence.out_keys, self._graph(*tensors), strict=True)
+        return {key: tensor.numpy(force=True) for key, tensor in written}
 
     def _trace(
         self, sequence: _Sequence, tensors: list[Tensor]
     ) -> Callable[..., tuple[Tensor, ...]]:
-        random = torch.get_rng_state()
+        # A trace runs the policy once more than steps are taken.
+        random, buffers = torch.get_rng_state(), list(self._policy.buffers())
+        before = [buffer.clone() for buffer in buffers]
         with warnings.catch_warnings():
             # Deprecated in PyTorch 2.13, in favour of what is slower to start (see above); and
             # a distribution's checks of its bounds are constants, as they should be.
             warnings.simplefilter("ignore")
             graph = torch.jit.trace(sequence, tuple(tensors), check_trace=False)
         torch.set_rng_state(random)
-        self._traced_with, self._shape = self._identity(), tensors[0].shape
-        self._held = self._weights()  # so that no other tensor gets the id of one of these
+        for buffer, value in zip(buffers, before, strict=True):
+            buffer.copy_(value)
+        self._shape = tensors[0].shape
         return graph
-
-    def _weights(self) -> tuple[Tensor, ...]:
-        return (*self._policy.parameters(), *self._policy.buffers())
-
-    def _identity(self) -> tuple[object, ...]:
-        # A graph sees new values in the weights it was traced with, but not new tensors.
-        return (*map(id, self._weights()), exploration_type())
 
 
 class _Sequence(nn.Module):
     """The leaves of a policy in order, from tensors to tensors."""
 
-    def __init__(
-        self,
-        leaves: list[TensorDictModuleBase],
-        in_keys: list[NestedKey],
-        out_keys: list[NestedKey],
-    ) -> None:
+    def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
+        # In a tuple, where tracing, which would stumble over tensordict's classes, does not look.
+        self.leaves = tuple(_leaves(policy))
         self.functions = nn.ModuleList(
             nn.Identity() if isinstance(leaf, ProbabilisticTensorDictModule) else leaf.module
-            for leaf in leaves
+            for leaf in self.leaves
         )
-        # In a tuple, where tracing, which would stumble over tensordict's classes, does not look.
-        self.leaves, self.in_keys, self.out_keys = tuple(leaves), in_keys, out_keys
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = [key for key in policy.out_keys if key != "_"]  # which is for what to drop
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         entries = dict(zip(self.in_keys, tensors, strict=True))
@@ -139,7 +153,42 @@ def _leaves(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
         yield module
 
 
-def _does_no_more_than_its_keys(leaf: TensorDictModuleBase) -> bool:
-    if isinstance(leaf, ProbabilisticTensorDictModule):
-        return not leaf.return_log_prob and leaf.num_samples is None
-    return type(leaf).forward is TensorDictModule.forward
+def _constants(policy: object) -> Iterator[object]:
+    """All that a graph has as it was when traced: it sees new values in tensors, and no others."""
+    yield exploration_type()
+    for module in _modules(policy):
+        yield module
+        for value in vars(module).values():
+            yield from value.values() if isinstance(value, dict) else (value,)
+
+
+def _opaque(policy: object) -> Iterator[object]:
+    """What a graph may not show all of."""
+    if not isinstance(policy, nn.Module):
+        yield policy
+    for module in _modules(policy):
+        is_hooked = bool(module._forward_hooks or module._forward_pre_hooks)
+        if is_hooked or not type(module).__module__.startswith(_KNOWN) or not _is_plain(module):
+            yield module
+
+
+def _modules(policy: object) -> Iterable[nn.Module]:
+    return policy.modules() if isinstance(policy, nn.Module) else ()
+
+
+def _is_plain(module: nn.Module) -> bool:
+    """Whether it does no more than its keys say."""
+    if isinstance(module, TensorDictSequential):
+        return not module.partial_tolerant
+    if isinstance(module, ProbabilisticTensorDictModule):
+        origin = getattr(module.distribution_class, "__module__", "")
+        return (
+            origin.startswith(_KNOWN_DISTRIBUTIONS)
+            and not module.return_log_prob
+            and module.num_samples is None
+            and module._generator is None
+            and module._generator_key is None
+        )
+    if isinstance(module, TensorDictModuleBase):
+        return calls_module_only(module)
+    return getattr(module, "momentum", 0) is not None  # a batch norm without one counts

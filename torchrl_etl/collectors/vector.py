@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from torchrl.envs import (
     set_exploration_type,
 )
 from torchrl.envs.transforms import Transform
+from torchrl.modules import RandomPolicy
 
 from torchrl_etl.collectors.policy_on_arrays import Arrays, PolicyOnArrays
 from torchrl_etl.transforms import SynergyAction
@@ -52,8 +54,10 @@ class VectorCollector(Collector):
 
     Args:
         create_env_fn (EnvBase or callable): the environment, or what builds it.
-        policy (TensorDictModule): what acts in it. A sequence of modules is evaluated on bare
-            tensors; anything else is called with a tensordict.
+        policy (TensorDictModule): what acts in it; random actions if there is none. A sequence of
+            modules of ``torch.nn``, TensorDict, TorchRL and this package is evaluated on bare
+            tensors, as one graph. One with modules of another's or with hooks, of which a graph
+            might miss something, is called with a tensordict, which is told in a warning.
         **kwargs: see :class:`torchrl.collectors.Collector`. The policy is trusted, and the batch
             is one preallocated tensordict.
 
@@ -92,6 +96,14 @@ class VectorCollector(Collector):
         self._synergy_action: SynergyAction | None = known.get(SynergyAction)
         self._on_arrays = [part for part in transforms if type(part) not in _KNOWN]
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
+        foreign = sorted(kind.__name__ for kind in self._policy_on_arrays.foreign)
+        if foreign and not isinstance(self._wrapped_policy, RandomPolicy):
+            warnings.warn(
+                f"The policy is called with a tensordict at each step, which takes longer than a "
+                f"traced graph, since a graph may miss what {', '.join(foreign)} does (hooks, "
+                "branches, counts); it can be traced if built of torch.nn and torchrl_etl.",
+                stacklevel=3,
+            )
 
     @staticmethod
     def takes(transform: Transform) -> bool:
@@ -132,14 +144,14 @@ class VectorCollector(Collector):
     def _fill(self, batch: TensorDictBase) -> TensorDictBase:
         self._policy_on_arrays.refresh()
         carrier = self._carrier
-        known = {*self.env.observation_keys, *self.env.state_keys, *self.env.done_keys}
-        now: Arrays = {key: carrier[key].numpy(force=True) for key in known}
-        now["collector", "traj_ids"] = carrier["collector", "traj_ids"].numpy(force=True)
+        recorded = set(batch.keys(True, True))
+        now: Arrays = {key: value.numpy(force=True) for key, value in carrier.items(True, True)}
         rows: dict[NestedKey, list[np.ndarray]] = defaultdict(list)
         for _ in range(self.frames_per_batch):
             written, after = self._step(now)
-            for key, value in (now | written).items():
-                rows[key].append(value)
+            now |= written  # stays there, for a policy that goes on from what it wrote
+            for key in now.keys() & recorded:
+                rows[key].append(now[key])
             for key, value in after.items():
                 rows["next", key].append(value)
             now = {key: after.get(key, value) for key, value in now.items()}
@@ -149,7 +161,7 @@ class VectorCollector(Collector):
         for key, values in rows.items():
             batch[key].copy_(torch.from_numpy(np.stack(values, axis=1)))
         for key, value in now.items():
-            carrier[key].copy_(torch.from_numpy(value))
+            carrier.set(key, torch.from_numpy(value))
         return batch
 
     def _step(self, now: Arrays) -> tuple[Arrays, Arrays]:
