@@ -10,6 +10,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.data import ListStorage, ReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
     ExplorationType,
@@ -19,6 +20,7 @@ from torchrl.envs import (
     TransformedEnv,
     set_exploration_type,
 )
+from torchrl.envs.transforms import Transform
 
 from tests.frozen_by_a_graph import CHANGES, MAKERS
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
@@ -273,6 +275,57 @@ def test_two_transforms_of_one_class_both_take_their_steps():
     ours = batches(VectorCollector, twice, policy)
     assert_same(ours, batches(Collector, twice, policy, **PLAIN))
     assert all(batch["next", key].any() for batch in ours for key in ("direction", "other"))
+
+
+class Pays(Transform):
+    """Writes an effort, and pays ten times the reward from there on."""
+
+    def __init__(self) -> None:
+        super().__init__(in_keys=[], out_keys=["effort"])
+
+    def _step(self, tensordict, next_tensordict):
+        effort = next_tensordict["observation"][..., :1]
+        return next_tensordict.update({"effort": effort, "reward": 10 * next_tensordict["reward"]})
+
+    def transform_reward_spec(self, spec):
+        spec["effort"] = Unbounded((3, 1))
+        return spec
+
+    def array_step(self, now, after):
+        after["effort"] = after["observation"][..., :1]
+        after["reward"] = 10 * after["reward"]
+
+    def array_reset(self, now, fresh, done):
+        """An effort is none of the root's."""
+
+
+def test_reward_sum_sums_what_it_names_as_its_place_among_transforms_has_it():
+    make, policy = parts("overactuated", "policy")
+
+    def paid(*transforms: Transform) -> TransformedEnv:
+        return TransformedEnv(make().base_env, Compose(*transforms))
+
+    for order in (
+        lambda: paid(Pays(), RewardSum(["effort", "reward"], ["efforts", "rewards"])),
+        lambda: paid(RewardSum(), Pays()),
+    ):
+        ours = batches(VectorCollector, order, policy)
+        assert_same(ours, batches(Collector, order, policy, **PLAIN))
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("replay_buffer", ReplayBuffer(storage=ListStorage(10))),
+        ("max_frames_per_traj", 5),
+        ("track_policy_version", True),
+        ("compact_obs", True),
+    ],
+)
+def test_what_it_does_not_take_is_refused_by_its_name(name, value):
+    make, policy = parts("overactuated", "policy")
+    with pytest.raises(ValueError, match=f"takes no {name}; leave it out, or use torchrl"):
+        VectorCollector(make, policy, frames_per_batch=12, **{name: value})
 
 
 def test_an_environment_that_it_does_not_know_is_refused():

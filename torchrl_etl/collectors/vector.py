@@ -31,7 +31,9 @@ from torchrl_etl.transforms import SynergyAction
 
 __all__ = ["VectorCollector"]
 
-_KNOWN = (RewardSum, InitTracker, SynergyAction)
+_AROUND_THE_STEP = (InitTracker, SynergyAction)
+_KNOWN = (RewardSum, *_AROUND_THE_STEP)
+_NOT_TAKEN = ("replay_buffer", "max_frames_per_traj", "track_policy_version", "compact_obs")
 
 
 class VectorCollector(Collector):
@@ -62,7 +64,9 @@ class VectorCollector(Collector):
             is one preallocated tensordict.
 
     Raises:
-        ValueError: if the environment is not such a one; use ``torchrl.collectors.Collector``.
+        ValueError: if the environment is not such a one, or for ``replay_buffer``,
+            ``max_frames_per_traj``, ``track_policy_version`` and ``compact_obs``; use
+            ``torchrl.collectors.Collector``.
 
     Examples:
         >>> from torchrl.envs import RewardSum, TransformedEnv
@@ -82,6 +86,12 @@ class VectorCollector(Collector):
         policy: TensorDictModuleBase | None = None,
         **kwargs: Any,
     ) -> None:
+        given = [name for name in _NOT_TAKEN if kwargs.get(name) not in (None, False, -1)]
+        if given:
+            raise ValueError(
+                f"VectorCollector takes no {given[0]}; leave it out, or use "
+                "torchrl.collectors.Collector."
+            )
         self._random = torch.get_rng_state()
         kwargs |= {
             "trust_policy": True,
@@ -91,10 +101,11 @@ class VectorCollector(Collector):
         super().__init__(create_env_fn, policy, **kwargs)
         self._simulators, transforms = _take_apart(self.env)
         known = {type(part): part for part in transforms if type(part) in _KNOWN}
-        self._reward_sum: RewardSum | None = known.get(RewardSum)
+        summed: RewardSum | None = known.get(RewardSum)
+        self._sums = [*zip(summed.in_keys, summed.out_keys, strict=True)] if summed else []
         self._init_tracker: InitTracker | None = known.get(InitTracker)
         self._synergy_action: SynergyAction | None = known.get(SynergyAction)
-        self._on_arrays = [part for part in transforms if type(part) not in _KNOWN]
+        self._in_order = [part for part in transforms if type(part) not in _AROUND_THE_STEP]
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
         foreign = sorted(kind.__name__ for kind in self._policy_on_arrays.foreign)
         if foreign and not isinstance(self._wrapped_policy, RandomPolicy):
@@ -180,13 +191,14 @@ class VectorCollector(Collector):
         after["reward"] = reward.astype(np.float32)[:, None]
         after["terminated"], after["truncated"] = terminated[:, None], truncated[:, None]
         after["done"] = after["terminated"] | after["truncated"]
-        if self._reward_sum is not None:
-            key = self._reward_sum.out_keys[0]
-            after[key] = now[key] + after["reward"]
         if self._init_tracker is not None:
             after[self._init_tracker.out_keys[0]] = np.zeros_like(after["done"])
-        for transform in self._on_arrays:
-            transform.array_step(now, after)
+        for transform in self._in_order:
+            if isinstance(transform, RewardSum):
+                for reward, total in self._sums:
+                    after[total] = now[total] + after[reward]
+            else:
+                transform.array_step(now, after)
         return written, after
 
     def _restart(self, now: Arrays, done: np.ndarray) -> Arrays:
@@ -194,13 +206,14 @@ class VectorCollector(Collector):
         fresh = _named(self._simulators.reset(options={"reset_mask": done})[0])
         for key in self.env.done_keys:
             fresh[key] = np.zeros_like(now[key])
-        if self._reward_sum is not None:
-            key = self._reward_sum.out_keys[0]
-            fresh[key] = np.where(done[:, None], np.float32(0), now[key])
         if self._init_tracker is not None:
             fresh[self._init_tracker.out_keys[0]] = done[:, None]
-        for transform in self._on_arrays:
-            transform.array_reset(now, fresh, done)
+        for transform in self._in_order:
+            if isinstance(transform, RewardSum):
+                for _, key in self._sums:
+                    fresh[key] = np.where(done[:, None], np.float32(0), now[key])
+            else:
+                transform.array_reset(now, fresh, done)
         if self._synergy_action is not None:
             key = self._synergy_action.executed_key
             rest = self._synergy_action.rest(self.env.batch_size).numpy()
