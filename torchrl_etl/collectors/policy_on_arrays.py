@@ -44,9 +44,8 @@ class PolicyOnArrays:
     policy with such a one is called as it is, with a tensordict of all arrays, and everything that
     is in it afterwards is returned, so that it finds it again if it gets it back.
 
-    Args:
-        policy (callable): the policy. Its weights may be updated in place at any time; where
-            anything else in it was changed, :meth:`refresh` finds out.
+    Weights may be updated in place at any time; where anything else was changed, :meth:`refresh`
+    finds out.
 
     Examples:
         >>> import numpy as np
@@ -56,12 +55,10 @@ class PolicyOnArrays:
         >>> written = policy({"observation": np.zeros((5, 3), np.float32)})
         >>> {key: value.shape for key, value in written.items()}
         {'loc': (5, 2), 'scale': (5, 2), 'action': (5, 2)}
-
-    Attributes:
-        foreign (list of types): other classes than this package's that prevent a graph.
     """
 
     foreign: list[type]
+    """Other classes than this package's that prevent a graph."""
 
     def __init__(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
         self._policy = policy
