@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import Bounded, Composite
+from torchrl.data import Bounded, Composite, Unbounded
 
 from torchrl_etl.baselines.dynsyn import make_dynsyn_actor
 from torchrl_etl.baselines.lattice import make_lattice_actor
@@ -20,6 +20,7 @@ from torchrl_etl.modules import (
     GaussianDynamics,
     StateEncoder,
     SynergyDecoder,
+    UniformWarmup,
     make_actor,
     make_critic,
 )
@@ -79,6 +80,20 @@ def test_from_spec_takes_size_and_bounds() -> None:
             GMVAE.from_spec(wrong, 2)
 
 
+@pytest.mark.parametrize("spec", [Unbounded((2,)), Bounded(-3e38, 3e38, shape=(2,))])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda spec: GMVAE.from_spec(spec, 1),
+        lambda spec: make_actor({"observation": 3}, spec),
+        lambda spec: UniformWarmup(spec, 3),
+    ],
+)
+def test_bounds_without_a_finite_range_are_refused(make: Any, spec: Any) -> None:
+    with pytest.raises(ValueError, match="without finite bounds; pass the bounded leaf"):
+        make(spec)
+
+
 def test_impossible_sizes_and_bounds_are_refused() -> None:
     with pytest.raises(ValueError, match="latent_dim is 5 but there are only 4 actuators"):
         GMVAE(4, 5)
@@ -88,6 +103,8 @@ def test_impossible_sizes_and_bounds_are_refused() -> None:
         GMVAE(4, 2, low=[0.0, 1.0, 0.0, 0.0], high=1.0)
     with pytest.raises(ValueError, match="every lower bound must be finite and below"):
         GMVAE(4, 2, low=float("-inf"))
+    with pytest.raises(ValueError, match="every lower bound must be finite and below"):
+        GMVAE(4, 2, low=-3e38, high=3e38)
     with pytest.raises(ValueError, match=r"shape \(2,\) but there are 4 actuators"):
         GMVAE(4, 2, low=[0.0, 0.0])
 

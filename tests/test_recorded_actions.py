@@ -8,7 +8,9 @@ import torch
 
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
+from torchrl_etl.objectives import GMVAELoss
 from torchrl_etl.synergies import fit_gmvae
+from torchrl_etl.synergies.gmvae import component_shares
 
 ACTIONS = np.tanh(np.random.default_rng(0).normal(size=(64, 2)) @ np.ones((2, 4)))
 WITH_NAN = ACTIONS.copy()
@@ -44,10 +46,14 @@ def numbers(made) -> torch.Tensor:
         pytest.param(ACTIONS.tolist(), id="lists"),
         pytest.param(ACTIONS.astype(np.float16).astype(np.float32)[::-1][::-1], id="strided"),
         pytest.param(ACTIONS.reshape(8, 8, 4), id="by episode"),
+        pytest.param(ACTIONS[::-1, ::-1], id="reversed"),
+        pytest.param(ACTIONS.astype(">f8"), id="big-endian"),
+        pytest.param(ACTIONS.astype(np.longdouble), id="long double"),
+        pytest.param(list(torch.from_numpy(ACTIONS)), id="list of tensors"),
     ],
 )
 def test_arrays_of_any_kind_give_the_numbers_of_the_tensor(use, given):
-    reference = torch.as_tensor(np.asarray(given)).float()
+    reference = torch.from_numpy(np.array(given, np.float64)).float()
     torch.manual_seed(1)
     expected = numbers(use(gmvae(), reference))
     torch.manual_seed(1)
@@ -73,7 +79,9 @@ def test_integers_and_constant_columns_give_finite_numbers(use):
         (WITH_NAN, ValueError, "NaN or infinity in 2 of 64 rows, the first in row 3"),
         (100 * ACTIONS, ValueError, r"bounds are \[-1, 1\]; bring the actions to these units"),
         (np.array([["a"] * 4]), TypeError, "no array of real numbers"),
-        (ACTIONS * 1j, TypeError, "complex"),
+        (ACTIONS * 1j, TypeError, "no array of real numbers"),
+        (torch.from_numpy(ACTIONS * 1j), TypeError, "complex"),
+        (np.ma.masked_greater(ACTIONS, 0.9), ValueError, "masked values; leave their rows out"),
     ],
 )
 def test_what_cannot_be_converted_is_refused_in_a_sentence(use, given, error, message):
@@ -82,6 +90,27 @@ def test_what_cannot_be_converted_is_refused_in_a_sentence(use, given, error, me
     with pytest.raises(error, match=message):
         use(model, given)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"updates": 0}, "updates is 0; it must be a whole number, 1 or more"),
+        ({"updates": 2, "batch_size": 0}, "batch_size is 0"),
+        ({"updates": 2, "loss": GMVAELoss(gmvae())}, "loss is of another GMVAE"),
+    ],
+)
+def test_a_fit_that_would_train_nothing_is_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        fit_gmvae(gmvae(), ACTIONS, **options)
+
+
+def test_a_fitted_gmvae_takes_the_arrays_that_it_was_fitted_to():
+    model = gmvae()
+    expected = model.reconstruct(torch.from_numpy(ACTIONS).float())
+    for given in (ACTIONS, torch.from_numpy(ACTIONS)):
+        assert torch.equal(model.reconstruct(given), expected)
+        assert component_shares(model, given).sum().item() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("use", USES[:2])

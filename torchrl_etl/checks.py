@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import numbers
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -19,6 +20,7 @@ __all__ = [
     "check_integer",
     "check_real",
     "check_sizes",
+    "check_width",
     "naming",
     "not_finite",
     "renaming",
@@ -72,7 +74,7 @@ def check_real(interval: str, **values: object) -> None:
     low, high = map(float, interval[1:-1].split(","))
     for name, value in values.items():
         within = (
-            isinstance(value, (int, float))
+            isinstance(value, numbers.Real)  # NumPy's scalars, too
             and not isinstance(value, bool)
             and math.isfinite(value)
             and (low <= value if interval[0] == "[" else low < value)
@@ -100,6 +102,23 @@ def check_sizes(**values: object) -> None:
             or not all(_is_integer(size) and size > 0 for size in value)
         ):
             raise ValueError(f"{name} is {value!r}; it must be a list of whole numbers above 0.")
+
+
+def check_width(size: int, **tensors: Tensor) -> None:
+    """Raise a ``ValueError`` naming the first tensor with another last size; 1 would be broadcast.
+
+    Examples:
+        >>> import torch
+        >>> check_width(4, synergy=torch.zeros(2, 1))
+        Traceback (most recent call last):
+        ...
+        ValueError: synergy has shape [2, 1]; its last size must be 4.
+    """
+    for name, tensor in tensors.items():
+        if tensor.shape[-1:] != (size,):
+            raise ValueError(
+                f"{name} has shape {list(tensor.shape)}; its last size must be {size}."
+            )
 
 
 class _NamedInFull(ValueError):
@@ -165,7 +184,7 @@ def check_flag(**values: object) -> None:
 
 
 def _is_integer(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def not_finite(state: Mapping[str, Tensor]) -> str | None:

@@ -14,6 +14,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
+from torchrl_etl.modules.recorded_actions import bounds_of
 
 __all__ = ["Body", "actor_with", "make_actor", "make_critic", "make_layers", "start_small"]
 
@@ -176,14 +177,14 @@ def actor_with(
     The distribution is built from the parameters, which the network makes of the inputs, ``low``,
     ``high`` and ``kwargs``.
     """
-    bounds = {"low": action_spec.space.low, "high": action_spec.space.high}
+    low, high = bounds_of(action_spec)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=list(inputs), out_keys=list(parameters)),
         in_keys=list(parameters),
         out_keys=[out_key],
         spec=action_spec,
         distribution_class=distribution,
-        distribution_kwargs={**bounds, **kwargs},
+        distribution_kwargs={"low": low, "high": high, **kwargs},
         default_interaction_type=InteractionType.RANDOM,
     )
 

@@ -6,14 +6,15 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import MLP
 
-from torchrl_etl.checks import check_integer
+from torchrl_etl.checks import check_integer, check_width
 from torchrl_etl.modules.clamp import Clamp
-from torchrl_etl.modules.recorded_actions import as_bounds
+from torchrl_etl.modules.recorded_actions import as_actions, as_bounds, bounds_of
 
 __all__ = ["GMVAE", "ActionDecoder", "Posterior"]
 
@@ -75,6 +76,7 @@ class ActionDecoder(nn.Module):
 
     def normalize(self, action: Tensor) -> Tensor:
         """Map [low, high] to [-1, 1]."""
+        check_width(self.action_dim, action=action)
         return 2 * (action - self.low) / (self.high - self.low) - 1
 
     def denormalize(self, unit: Tensor) -> Tensor:
@@ -168,26 +170,25 @@ class GMVAE(nn.Module):
         """Build for one (unbatched) bounded action spec, taking n and the bounds from it.
 
         Raises:
-            ValueError: if the spec is not one leaf of shape [n].
+            ValueError: if the spec is not one leaf of shape [n] with finite bounds.
 
         Examples:
             >>> from torchrl.data import Bounded
             >>> GMVAE.from_spec(Bounded(0, 1, shape=(80,)), latent_dim=4).high.max().item()
             1.0
         """
-        space = getattr(action_spec, "space", None)
-        if not hasattr(space, "low") or len(action_spec.shape) != 1:
+        low, high = bounds_of(action_spec)
+        if low.ndim != 1:
             raise ValueError(
-                f"The action spec is a {type(action_spec).__name__} of shape "
-                f"{tuple(action_spec.shape)}; pass the bounded leaf of one environment, of shape "
-                "[n], such as env.action_spec_unbatched."
+                f"The action spec has shape {tuple(low.shape)}; pass the bounded leaf of one "
+                "environment, of shape [n], such as env.action_spec_unbatched."
             )
         return cls(
             action_spec.shape[0],
             latent_dim,
             num_components,
-            low=space.low.tolist(),
-            high=space.high.tolist(),
+            low=low.tolist(),
+            high=high.tolist(),
             **kwargs,
         )
 
@@ -242,15 +243,15 @@ class GMVAE(nn.Module):
         """Mean action [*, n], inside the bounds, for latents [*, d]."""
         return self.decoder(latent)
 
-    def infer(self, action: Tensor) -> Tensor:
-        """Posterior mean E[z|a] [*, d], under the likeliest component.
+    def infer(self, action: Tensor | np.ndarray) -> Tensor:
+        """Posterior mean E[z|a] [*, d] of recorded actions, under the likeliest component.
 
         The mean over components can fall between two modes, where no action lives.
         """
-        posterior = self.encode(action)
+        posterior = self.encode(as_actions(action, low=self.low, high=self.high))
         best = posterior.logits.argmax(-1)[..., None, None]
         return posterior.loc.take_along_dim(best, -2).squeeze(-2)
 
-    def reconstruct(self, action: Tensor) -> Tensor:
+    def reconstruct(self, action: Tensor | np.ndarray) -> Tensor:
         """Actions [*, n] through the posterior mean and back."""
         return self.decode(self.infer(action))

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
 
-__all__ = ["as_actions", "as_bounds"]
+__all__ = ["as_actions", "as_bounds", "bounds_of"]
 
 # Recordings overshoot their bounds a little: filters ring, and estimates are noisy.
 OVERSHOOT = 0.1
@@ -46,8 +47,10 @@ def as_actions(
         ...
         ValueError: The actions have shape (2, 4), but there are 3 actuators; pass an array [N, 3].
     """
+    if np.ma.is_masked(actions):
+        raise ValueError("The actions have masked values; leave their rows out, or fill them.")
     try:
-        found = torch.as_tensor(actions)
+        found = actions if isinstance(actions, Tensor) else _from_array(actions)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(
             f"The actions are a {type(actions).__name__} that is no array of real numbers; pass "
@@ -101,13 +104,42 @@ def as_bounds(low: Any, high: Any, action_dim: int) -> tuple[Tensor, Tensor]:
                 "actuators; pass one number, or one for each."
             )
     low, high = low.expand(action_dim).clone(), high.expand(action_dim).clone()
-    if not (low.isfinite() & high.isfinite() & (low < high)).all():
+    if not ((high - low).isfinite() & (low < high)).all():
         raise ValueError(
             f"The action bounds are low={low.tolist()} and high={high.tolist()}; every lower "
             "bound must be finite and below its upper bound. Take them from the environment's "
             "action spec."
         )
     return low, high
+
+
+def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
+    """Both bounds of a ``Bounded`` leaf; those of an ``Unbounded`` one are the largest numbers.
+
+    Raises:
+        ValueError: if the spec is another, or its range is not finite.
+
+    Examples:
+        >>> bounds_of(Bounded(0, 1, shape=(2,)))
+        (tensor([0., 0.]), tensor([1., 1.]))
+    """
+    if isinstance(action_spec, Bounded):
+        low, high = action_spec.space.low, action_spec.space.high
+        if (high - low).isfinite().all():
+            return low, high
+    raise ValueError(
+        f"The action spec is a {type(action_spec).__name__} of shape {tuple(action_spec.shape)} "
+        "without finite bounds; pass the bounded leaf of one environment, such as "
+        "env.action_spec_unbatched."
+    )
+
+
+def _from_array(actions: np.ndarray | Sequence[Any]) -> Tensor:
+    array = np.asarray(actions)
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"Its dtype is {array.dtype}.")
+    # A copy: torch has neither negative strides nor other byte orders nor more digits.
+    return torch.from_numpy(np.array(array, np.float64, order="C"))
 
 
 def _check_values(rows: Tensor, low: Tensor, high: Tensor) -> None:

@@ -10,6 +10,7 @@ from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.checks import check_integer
+from torchrl_etl.modules.recorded_actions import bounds_of
 
 __all__ = ["UniformWarmup"]
 
@@ -34,7 +35,7 @@ class UniformWarmup(TensorDictModuleBase):
         reads and writes ``action`` [*, n], within the bounds of the spec.
 
     Raises:
-        ValueError: if frames is negative.
+        ValueError: if frames is negative, or the spec has no finite bounds.
 
     Examples:
         >>> import torch
@@ -57,12 +58,13 @@ class UniformWarmup(TensorDictModuleBase):
         self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"
     ) -> None:
         check_integer(0, frames=frames)
+        low, high = bounds_of(action_spec)
         super().__init__()
         self.frames, self.seen = frames, 0
         self.action_key = unravel_key(action_key)
         self.in_keys = self.out_keys = [self.action_key]
-        self.register_buffer("low", action_spec.space.low.clone(), persistent=False)
-        self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
+        self.register_buffer("low", low.clone(), persistent=False)
+        self.register_buffer("high", high.clone(), persistent=False)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

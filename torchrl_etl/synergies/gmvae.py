@@ -92,13 +92,14 @@ class GMVAESynergies(SynergyModel):
 
 
 @torch.no_grad()
-def component_shares(gmvae: GMVAE, actions: Tensor) -> Tensor:
+def component_shares(gmvae: GMVAE, actions: Tensor | np.ndarray) -> Tensor:
     """Share of the actions [N, n] in each component [C]: mean q(c|a).
 
     Examples:
         >>> component_shares(GMVAE(39, 4), torch.rand(64, 39)).sum().round()
         tensor(1.)
     """
+    actions = as_actions(actions, low=gmvae.low, high=gmvae.high)
     # In pieces: all hidden layers at once would take far more memory than the answer.
     shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
     return shares / len(actions)
@@ -129,7 +130,7 @@ def fit_gmvae(
     Raises:
         TypeError, ValueError: before anything is trained, if the actions are not numbers, have
             another width than the GMVAE, a value that is not finite or far outside of its bounds,
-            or one row only.
+            or one row only; if a number is not positive, or the loss is of another GMVAE.
 
     Examples:
         >>> import torch
@@ -140,8 +141,11 @@ def fit_gmvae(
         >>> variance_accounted_for(actions, gmvae.reconstruct(actions).detach()) > 0.8
         True
     """
+    check_integer(1, updates=updates, batch_size=batch_size)
     actions = as_actions(actions, low=gmvae.low, high=gmvae.high, min_rows=2)
     loss = GMVAELoss(gmvae) if loss is None else loss
+    if loss.gmvae_params["prior_loc"] is not gmvae.prior_loc:
+        raise ValueError("loss is of another GMVAE; pass GMVAELoss(gmvae), or leave it out.")
     optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
     for _ in range(updates):
         on_update()
