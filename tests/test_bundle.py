@@ -200,9 +200,17 @@ def test_saving_refuses_wrong_names_and_facts_that_json_cannot_hold(tmp_path):
     for names in (NAMES[:4], NAMES[:4] + NAMES[:1]):
         with pytest.raises(BundleError, match="decoder for 5 actuators"):
             save_bundle(decoder, tmp_path / "b", task="toy", actuators=names)
+    for name, value in (("task", None), ("kind", 3)):
+        with pytest.raises(BundleError, match=f"{name} is {value}; it must be a text"):
+            save_bundle(decoder, tmp_path / "b", **{"task": "toy", "actuators": NAMES, name: value})
     with pytest.raises(BundleError, match=r"facts\['a'\]\[1\] is a object"):
         save(decoder, tmp_path / "b", a=[1, object()])
     assert not list(tmp_path.iterdir())
+
+
+def test_names_of_actuators_are_texts(tmp_path):
+    folder = save_bundle(fitted_decoder(), tmp_path / "b", task="toy", actuators=range(5))
+    assert load_bundle(folder)[1].actuators == ("0", "1", "2", "3", "4")
 
 
 def info(names=NAMES, low=0.0, high=1.0):

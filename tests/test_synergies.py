@@ -167,7 +167,8 @@ def test_arrays_of_any_kind_are_taken_and_bad_ones_are_refused_in_a_sentence(kin
     actions = activity().double().numpy()
     decoder = fitted(kind, actions).decoder(actions)
     assert decoder.low.tolist() == [0.0] * 6 and decoder.num_synergies == 2
-    fitted(kind, actions.tolist())
+    rebuilt = fitted(kind, actions.tolist()).reconstruct(actions)
+    assert rebuilt.shape == (400, 6) and rebuilt.dtype == torch.float32
     actions[3, 1] = np.nan
     with pytest.raises(ValueError, match="NaN or infinity in 1 of 400 rows, the first in row 3"):
         fitted(kind, actions)
@@ -177,6 +178,15 @@ def test_arrays_of_any_kind_are_taken_and_bad_ones_are_refused_in_a_sentence(kin
         fit_synergies(activity(), kind, 7, low=0.0, high=1.0)
     with pytest.raises(ValueError, match=r"shape \(3,\) but there are 6 actuators"):
         fit_synergies(activity(), kind, 2, low=[0.0] * 3, high=1.0)
+
+
+def test_numbers_may_be_numpys(tmp_path) -> None:
+    options = {"lr": np.float32(1e-3), "updates": np.int64(2), "hidden": [np.int64(8)]}
+    model = fit_synergies(activity(), "gmvae", np.int64(2), low=0.0, high=1.0, **options)
+    model.save(tmp_path / "b", activity(), task="toy", actuators=list("abcdef"))
+    assert load_bundle(tmp_path / "b")[1].num_synergies == 2
+    with pytest.raises(ValueError, match="num_components is True"):
+        fit_synergies(activity(), "gmvae", 2, num_components=True)
 
 
 def test_an_unknown_kind_is_refused_with_the_nearest() -> None:

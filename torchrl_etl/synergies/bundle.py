@@ -72,8 +72,8 @@ def save_bundle(
             layers, else ``"gmvae"``.
 
     Raises:
-        BundleError: if the names do not fit the decoder, a fact cannot be written as JSON, or
-            ``path`` holds anything but a bundle.
+        BundleError: if task or kind are no text, the names do not fit the decoder, a fact cannot
+            be written as JSON, or ``path`` holds anything but a bundle.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -87,7 +87,11 @@ def save_bundle(
         >>> info.task, info.actuators, copy.num_synergies
         ('toy', ('a', 'b', 'c'), 2)
     """
-    actuators = tuple(actuators)
+    kind = default_kind(decoder.is_affine) if kind is None else kind
+    for name, value in {"task": task, "kind": kind}.items():
+        if not isinstance(value, str):
+            raise BundleError(f"{name} is {value!r}; it must be a text.")
+    actuators = tuple(map(str, actuators))
     if len(actuators) != decoder.action_dim or len(set(actuators)) != len(actuators):
         raise BundleError(
             f"{len(actuators)} actuator names ({len(set(actuators))} different) came with a "
@@ -110,13 +114,13 @@ def save_bundle(
         actuators=actuators,
         low=tuple(decoder.low.tolist()),
         high=tuple(decoder.high.tolist()),
-        num_synergies=decoder.num_synergies,
+        num_synergies=int(decoder.num_synergies),
         residual=float(config.get("residual", 0.0)),
         config=config,
         sha256=hashlib.sha256(tensors).hexdigest(),
         facts=_plain(dict(facts or {}), "facts"),
-        kind=default_kind(decoder.is_affine) if kind is None else kind,
-        encoder=None if encoder is None else encoder.config,
+        kind=kind,
+        encoder=None if encoder is None else _plain(encoder.config, "encoder"),
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
     folder = own_folder(path, BUNDLE_FILES, "a bundle", BundleError)
