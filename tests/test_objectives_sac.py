@@ -19,7 +19,7 @@ from tensordict.nn import (
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from tests import test_objectives_synergy_sac as synergy
 from tests.loss_checks import SEED
@@ -119,6 +119,24 @@ def test_what_it_cannot_do_is_refused() -> None:
         LeanSACLoss(actor, nn.Linear(2, 5))
     with pytest.raises(TypeError, match="actor_network is a Linear"):
         LeanSACLoss(nn.Linear(2, 5), critic)
+
+
+def test_a_support_is_refused_beside_returns_of_many_steps() -> None:
+    loss = make_loss(bins=11, support=torch.linspace(-5.0, 5.0, 11))
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    for kind in (ValueEstimators.TD1, ValueEstimators.TDLambda):
+        with pytest.raises(ValueError, match="with a support targets are distributions"):
+            loss.make_value_estimator(kind, gamma=GAMMA)
+
+
+@pytest.mark.parametrize(("bins", "entries"), [(11, None), (1, 11), (7, 11)])
+def test_critics_of_another_size_than_the_support_are_one_sentence(
+    bins: int, entries: int | None
+) -> None:
+    support = None if entries is None else torch.linspace(-5.0, 5.0, entries)
+    words = rf"have {bins} output\(s\) and the support {entries or 1} \(1 stands for none\)"
+    with pytest.raises(ValueError, match=words):
+        make_loss(bins=bins, support=support)(TestLeanSACLoss().make_data())
 
 
 class Value(nn.Module):

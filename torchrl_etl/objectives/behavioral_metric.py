@@ -14,7 +14,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, read
 from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners, target_params
 
 __all__ = ["BehavioralMetricLoss"]
@@ -189,7 +189,7 @@ class BehavioralMetricLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
-        reward = tensordict["next"].get(self.tensor_keys.reward)
+        reward = read(type(self).__name__, tensordict["next"], self.tensor_keys.reward, "next")
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale
         partner = partners(reward.numel(), reward.device, self.pairs)

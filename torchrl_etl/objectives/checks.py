@@ -5,10 +5,37 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 
-__all__ = ["check_parts", "warn_of_previous_action"]
+__all__ = ["check_parts", "read", "warn_of_previous_action"]
+
+
+def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
+    """An entry, or a ``KeyError`` that names it, and says of an action where it is.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> read("DecoderLoss", TensorDict({"synergy": 0.0}), "action")
+        Traceback (most recent call last):
+        ...
+        KeyError: "DecoderLoss reads 'action', which the data lacks; beside it are synergy."
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        there = tensordict.keys(True, True)
+        cure = ""
+        if key == "action" and ("next", "executed_action") in there:
+            cure = (
+                "; RenameTransform([('next', 'executed_action')], ['action'], create_copy=True) "
+                "makes one of what was executed"
+            )
+        raise KeyError(
+            f"{reader} reads {unravel_key((*prefix, key))!r}, which the data lacks; beside it are "
+            f"{', '.join(sorted(map(str, there)))}{cure}."
+        )
+    return value
 
 
 def warn_of_previous_action(reader: str, keys: Iterable[NestedKey]) -> None:

@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, check_width
 from torchrl_etl.functional import reconstruction_loss
-from torchrl_etl.objectives.checks import check_parts, warn_of_previous_action
+from torchrl_etl.objectives.checks import check_parts, read, warn_of_previous_action
 
 __all__ = ["DecoderLoss"]
 
@@ -90,10 +90,12 @@ class DecoderLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
-        synergy = tensordict.get(self.tensor_keys.synergy).detach()
-        action = tensordict.get(self.tensor_keys.action).detach()
+        name, keys = type(self).__name__, self.tensor_keys
+        synergy = read(name, tensordict, keys.synergy).detach()
+        action = read(name, tensordict, keys.action).detach()
         inputs = TensorDict({self.decoder.in_keys[0]: synergy}, synergy.shape[:-1])
         with self.decoder_params.to_module(self.decoder, preserve_module_state=False):
             decoded = self.decoder(inputs).get(self.decoder.out_keys[0])
+        check_width(decoded.shape[-1], action=action)
         loss = reconstruction_loss(decoded, action)
         return TensorDict({"loss_decoder": self._reduce_loss(loss, tensordict)})

@@ -15,7 +15,7 @@ from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules import GMVAE
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, read
 
 __all__ = ["GMVAELoss"]
 
@@ -104,7 +104,7 @@ class GMVAELoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
-        action = tensordict.get(self.tensor_keys.action).detach()
+        action = read(type(self).__name__, tensordict, self.tensor_keys.action).detach()
         gmvae = self.gmvae
         with self.gmvae_params.to_module(gmvae, preserve_module_state=False):
             posterior = gmvae.encode(action)

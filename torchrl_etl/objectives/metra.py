@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, read
 
 __all__ = ["METRALoss"]
 
@@ -138,10 +138,11 @@ class METRALoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
-        direction = tensordict.get(self.tensor_keys.direction).detach()
+        name = type(self).__name__
+        direction = read(name, tensordict, self.tensor_keys.direction).detach()
         batch_size = direction.shape[:-1]
         embedding = self._embed(tensordict, batch_size)
-        next_embedding = self._embed(tensordict.get("next"), batch_size)
+        next_embedding = self._embed(read(name, tensordict, "next"), batch_size)
         if embedding.shape[-1] != direction.shape[-1]:
             raise ValueError(
                 f"The encoder's embedding has {embedding.shape[-1]} dimensions but the direction "

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_etl.draws import uniform_order
+from torchrl_etl.objectives.checks import read
 
 __all__ = ["embedded_ends", "outputs", "partners", "target_params"]
 
@@ -63,5 +64,5 @@ def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor,
     with torch.no_grad():
         following = tensordict["next"]
         next_embedding = outputs(loss.encoder, target_params(loss), following)
-        ended = following.get(loss.tensor_keys.terminated).reshape(-1, 1)
-        return embedding, next_embedding.masked_fill(ended, 0.0)
+        ended = read(type(loss).__name__, following, loss.tensor_keys.terminated, "next")
+        return embedding, next_embedding.masked_fill(ended.reshape(-1, 1), 0.0)

@@ -16,13 +16,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
-from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.utils import ValueEstimators, distance_loss
 
 from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.functional import categorical_cross_entropy, categorical_mean, project_categorical
 from torchrl_etl.modules.calls import calls_module_only
-from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.checks import check_parts, read
 
 __all__ = ["LeanSACLoss", "call"]
 
@@ -64,9 +64,9 @@ class LeanSACLoss(SACLoss):
         TypeError: if actor or critic is of another class, or a ``value_network`` or
             ``skip_done_states`` is given.
         ValueError: for an unknown reduction or ``loss_function``, a support that is not evenly
-            spaced and ascending, ``counted`` with an actor that is no tanh-Gaussian, an
-            actor that samples several keys, or a critic of several outputs none of which is the
-            ``state_action_value``.
+            spaced and ascending or not of the critics' size, ``counted`` with an actor that is no
+            tanh-Gaussian, an actor that samples several keys, or a critic of several outputs none
+            of which is the ``state_action_value``.
 
     Examples:
         >>> import torch
@@ -142,6 +142,22 @@ class LeanSACLoss(SACLoss):
         super().set_keys(**kwargs)
         self._value_key = value_key(self.qvalue_network, self.tensor_keys.state_action_value)
 
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> SACLoss | None:
+        """See :meth:`torchrl.objectives.SACLoss.make_value_estimator`.
+
+        Raises:
+            ValueError: for another estimator than TD0 with a ``support``: a target of many steps
+                is a value, and what a distribution of the return needs is a step's.
+        """
+        if self.support is not None and value_type not in (None, ValueEstimators.TD0):
+            raise ValueError(
+                f"value_type is {value_type}, but with a support targets are distributions, which "
+                "go back one step; take ValueEstimators.TD0, or leave the support out."
+            )
+        return super().make_value_estimator(value_type, **hyperparams)
+
     def _make_vmap(self) -> None:
         """Nothing is vmapped."""
 
@@ -172,6 +188,12 @@ class LeanSACLoss(SACLoss):
 
     def _mean(self, outputs: Tensor) -> Tensor:
         """Q-values [critics, *] of these outputs."""
+        bins = 1 if self.support is None else len(self.support)
+        if outputs.shape[-1] != bins:
+            raise ValueError(
+                f"The critics have {outputs.shape[-1]} output(s) and the support {bins} (1 stands "
+                "for none); give both as many: make_critic(bins=...), support=torch.linspace(...)."
+            )
         if self.support is None:
             return outputs.squeeze(-1)
         return categorical_mean(outputs, self.support)
@@ -186,7 +208,7 @@ class LeanSACLoss(SACLoss):
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         """Target values [*]; with categorical critics, target probabilities [*, K]."""
         with torch.no_grad():
-            following = tensordict.get("next")
+            following = read(type(self).__name__, tensordict, "next")
             action, log_prob = self._sample(following)
             prefix = "target_" if self.delay_qvalue else ""
             weights = self._weights(f"{prefix}qvalue_network")
@@ -296,5 +318,5 @@ def call(
         inputs = inputs.select(*network.in_keys, strict=False).copy()
         return functional_call(network, weights, (inputs,), tie_weights=False).get(out_key)
     own = {name.removeprefix("module."): weight for name, weight in weights.items()}
-    tensors = tuple(inputs.get(key) for key in network.in_keys)
+    tensors = tuple(read("The critic", inputs, key) for key in network.in_keys)
     return functional_call(network.module, own, tensors, tie_weights=False)

@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from torchrl_etl.objectives.checks import read
 from torchrl_etl.transforms.keys import SoleWriter, private_key, set_leaf, set_where_reset
 
 __all__ = ["TransitionReward", "evaluate"]
@@ -61,13 +62,7 @@ class TransitionReward(SoleWriter):
         return private_key(self.out_keys[0], self.in_keys[0])
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(
-                f"{type(self).__name__} reads {unravel_key((*prefix, key))!r}, which the data "
-                f"lacks; beside it are {sorted(map(str, tensordict.keys(True, True)))}."
-            )
-        return value
+        return read(type(self).__name__, tensordict, key, *prefix)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict = tensordict.get("next", None)
