@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 import torch
 
 from torchrl_etl.modules import RunningNorm
+from torchrl_etl.modules.running_deviation import RunningDeviation
 
 SEEN = torch.tensor([[1.0, -3.0, 7.0], [2.0, 5.0, 7.0], [6.0, 1.0, 7.0], [3.0, 9.0, 7.0]])
 
@@ -30,6 +33,21 @@ def test_batches_of_any_shape_count_as_rows():
     norm.see(SEEN.view(2, 2, 3))
     flat.see(SEEN)
     torch.testing.assert_close(norm(SEEN.view(2, 2, 3)), flat(SEEN).view(2, 2, 3))
+
+
+@pytest.mark.parametrize("take", [RunningNorm(3).see, RunningDeviation(decay=0.9).update])
+def test_an_empty_batch_changes_nothing(take):
+    take(SEEN)
+    before = deepcopy(take.__self__.state_dict())
+    take(SEEN[:0])
+    for name, value in take.__self__.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_whole_numbers_are_normalized_as_the_same_real_ones():
+    norm = RunningNorm(3)
+    norm.see(SEEN.long() * 3 + 1)
+    assert torch.equal(norm(SEEN.long()), norm(SEEN))
 
 
 def test_nothing_seen_leaves_observations_as_they_are():

@@ -41,6 +41,8 @@ class RunningDeviation(nn.Module):
         self.register_buffer("weight", torch.zeros(()))
 
     def update(self, values: Tensor) -> None:
+        if not values.numel():
+            return
         if self.mean.device != values.device:
             self.to(values.device)
         self.weight.mul_(self.decay).add_(1 - self.decay)

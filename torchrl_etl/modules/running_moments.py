@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torchrl_etl.checks import check_width
+
 __all__ = ["RunningMoments"]
 
 
@@ -32,8 +34,12 @@ class RunningMoments(nn.Module):
 
     @torch.no_grad()
     def see(self, values: Tensor) -> None:
-        """Take in values [*, *shape]."""
+        """Take in values [*, *shape], perhaps none."""
+        if self.mean.ndim:
+            check_width(self.mean.shape[-1], values=values)
         rows = values.reshape(-1, *self.mean.shape).to(self.mean)
+        if not len(rows):
+            return
         # Chan's parallel variance: exact, whatever the batches are.
         count, mean = self.count + len(rows), rows.mean(0)
         shift = mean - self.mean

@@ -45,6 +45,8 @@ class RunningNorm(RunningMoments):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Observations [*, size] in standard deviations; as they are before any was seen."""
+        if not observation.is_floating_point():  # of whose dtype the mean would be
+            observation = observation.float()
         # What never varied stays where it is, at zero, rather than being blown up.
         std = torch.where(self.variance > 1e-12, self.variance, 1.0).sqrt()
         normalized = (observation - self.mean.to(observation)) / std.to(observation)
