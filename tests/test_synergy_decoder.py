@@ -106,6 +106,11 @@ def test_no_residual_is_without_effect_at_the_ends_of_the_range() -> None:
     assert decoder.log_slope(synergy).isfinite().all()
 
 
+def test_a_key_by_itself_is_one_key() -> None:
+    decoder = SynergyDecoder(2, 4, in_keys="syn", out_keys="act")
+    assert (decoder.in_keys, decoder.out_keys) == (["syn"], ["act"])
+
+
 @pytest.mark.parametrize("residual", [-0.1, 1.1])
 def test_residual_share_is_checked(residual: float) -> None:
     with pytest.raises(ValueError, match=r"must lie in \[0, 1\]"):

@@ -5,7 +5,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded, Categorical
-from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.latent_action_checks import D, LatentActionChecks, fixed_decoder
@@ -60,6 +60,41 @@ def test_a_latent_of_numbered_choices_moves_the_env_by_its_rows(batch_size):
     assert rollout["latent"].shape == (*batch_size, 3)
     expected = module.module.weight.detach()[rollout["latent"]]
     assert torch.equal(rollout["next", "executed_action"], expected)
+
+
+def push(latent):
+    """One of CartPole's two actions, a number without a size of its own."""
+    return (latent.sum(-1) > 0).long()
+
+
+def cart_pole():
+    return GymEnv("CartPole-v1", categorical_action_encoding=True)
+
+
+def of_pushes(env):
+    return TransformedEnv(env, LatentAction(TensorDictModule(push, ["z"], ["action"]), SPEC))
+
+
+@pytest.mark.parametrize(
+    ("make", "batch_size"),
+    [
+        (lambda: of_pushes(cart_pole()), ()),
+        (lambda: of_pushes(SerialEnv(2, cart_pole)), (2,)),
+        (lambda: SerialEnv(2, lambda: of_pushes(cart_pole())), (2,)),
+    ],
+)
+def test_an_action_that_is_one_number_is_decoded_for_each_row(make, batch_size):
+    env = make()
+    check_env_specs(env)
+    rollout = env.rollout(3)
+    assert rollout["latent"].shape == (*batch_size, 3, D)
+    assert torch.equal(rollout["next", "executed_action"], push(rollout["latent"]))
+
+
+def test_a_number_is_refused_where_the_env_takes_several():
+    module = TensorDictModule(push, ["z"], ["action"])
+    with pytest.raises(ValueError, match=r"makes actions of shape \[\] .* 'action' has \[5\]"):
+        TransformedEnv(PointEnv(), LatentAction(module, SPEC))
 
 
 @pytest.mark.parametrize("place", [lambda t: t, lambda t: Compose(StepCounter(), t)])

@@ -14,12 +14,12 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import GymWrapper, TransformedEnv
 
 from tests.configs import ROOT
 from tests.test_docs import BLOCK
 from torchrl_etl.envs import SynergyActionWrapper, actuator_names, make_env
-from torchrl_etl.modules import SynergyDecoder, make_actor, policy_function
+from torchrl_etl.modules import GMVAE, SynergyDecoder, make_actor, policy_function
 from torchrl_etl.synergies import BundleError, save_bundle
 from torchrl_etl.transforms import SynergyAction
 
@@ -57,6 +57,37 @@ def test_the_wrapper_does_what_the_transform_does(residual):
         assert reward == pytest.approx(state["reward"].item())
 
 
+class DoublePrecision(gymnasium.Env):
+    """Bounds that single precision rounds outwards; refuses actions beyond."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gymnasium.spaces.Box(-0.3, 0.3, (5,), np.float64)
+
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+def step_wrapped(decoder, synergy):
+    SynergyActionWrapper(DoublePrecision(), decoder).step(np.array([synergy], np.float32))
+
+
+def step_transformed(decoder, synergy):
+    env = TransformedEnv(GymWrapper(DoublePrecision()), SynergyAction(decoder))
+    env.step(env.reset().set("synergy", torch.tensor([synergy])))
+
+
+@pytest.mark.parametrize("step", [step_wrapped, step_transformed])
+@pytest.mark.parametrize("synergy", [-1.0, 1.0])
+def test_actions_at_bounds_in_double_precision_stay_inside(step, synergy):
+    far = torch.full((1, 5), 99.0)
+    step(SynergyDecoder.from_directions(torch.zeros(5), far, low=-0.3, high=0.3), synergy)
+
+
 def test_gymnasium_s_checker_finds_no_fault(bundle):
     env = SynergyActionWrapper(gymnasium.make(TASK), bundle)
     with warnings.catch_warnings():
@@ -82,6 +113,8 @@ def test_the_muscles_of_a_bundle_must_be_the_environment_s(tmp_path):
         SynergyActionWrapper(env, bundle)
     with pytest.raises(BundleError, match="There is no synergy bundle"):
         SynergyActionWrapper(env, tmp_path / "nowhere")
+    with pytest.raises(TypeError, match="bundle is a GMVAE; pass a bundle's folder, or a decoder"):
+        SynergyActionWrapper(env, GMVAE(16, 2))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from torchrl_etl.checks import check_width
 from torchrl_etl.envs.action_space import check_action_space
 from torchrl_etl.envs.factory import actuator_names
 from torchrl_etl.modules import SynergyMap
@@ -36,6 +37,7 @@ class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
             the agent.
 
     Raises:
+        TypeError: if ``bundle`` is neither.
         BundleError: if there is no bundle, or it is of other muscles or bounds.
         ValueError: if the actions are no flat box of real numbers, or do not fit the decoder.
 
@@ -57,6 +59,11 @@ class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
         *,
         residual: float | None = None,
     ) -> None:
+        if not isinstance(bundle, (str, os.PathLike, SynergyMap)):
+            raise TypeError(
+                f"bundle is a {type(bundle).__name__}; pass a bundle's folder, or a decoder such "
+                "as SynergyDecoder.from_gmvae(gmvae)."
+            )
         given = bundle if isinstance(bundle, SynergyMap) else os.fspath(bundle)
         gym.utils.RecordConstructorArgs.__init__(self, bundle=given, residual=residual)
         gym.ActionWrapper.__init__(self, env)
@@ -83,8 +90,10 @@ class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
     def action(self, action: np.ndarray) -> np.ndarray:
         """The muscles' action [n] of coefficients [d], or [d + n] with a residual."""
         synergy = torch.as_tensor(action, dtype=self.decoder.low.dtype)
+        check_width(self.action_space.shape[0], action=synergy)
         decoded = self.decoder.module(synergy.to(self.decoder.low.device))
-        return decoded.cpu().numpy().astype(self.env.action_space.dtype)
+        box = self.env.action_space  # whose bounds single precision may round outwards
+        return decoded.cpu().numpy().astype(box.dtype).clip(box.low, box.high)
 
 
 def _check_decoder(decoder: SynergyMap, box: spaces.Box) -> None:

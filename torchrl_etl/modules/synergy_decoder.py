@@ -11,6 +11,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_etl.checks import check_width
 from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
@@ -49,6 +50,8 @@ class _ScaledDecoder(nn.Module):
         self.register_buffer("scale", torch.ones(decoder.latent_dim))
 
     def forward(self, synergy: Tensor) -> Tensor:
+        direct = self.decoder.action_dim if self.residual else 0
+        check_width(self.decoder.latent_dim + direct, synergy=synergy)
         if not self.residual:
             return self.decoder(self.center + self.scale * synergy)
         return self.decoder.denormalize(tanh_sum(*self.summands(synergy)))
@@ -91,7 +94,8 @@ class SynergyDecoder(SynergyMap):
 
     Attributes:
         encoder (GMVAE, optional): a frozen copy of the model that the decoder was made from, by
-            which it encodes. It is no submodule: nothing trains it, and it is in no state dict.
+            which it encodes. It is no submodule: nothing trains it, and it is in no state dict:
+            with the weights of another decoder goes ``carry(other.encoder)``.
 
     Raises:
         ValueError: if a size is not positive or ρ is outside [0, 1].
@@ -127,7 +131,9 @@ class SynergyDecoder(SynergyMap):
             )
         decoder = ActionDecoder(num_synergies, action_dim, low=low, high=high, hidden=hidden)
         super().__init__(
-            _ScaledDecoder(decoder, residual), in_keys=list(in_keys), out_keys=list(out_keys)
+            _ScaledDecoder(decoder, residual),
+            in_keys=[in_keys] if isinstance(in_keys, str) else list(in_keys),
+            out_keys=[out_keys] if isinstance(out_keys, str) else list(out_keys),
         )
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
         self.carry(None)

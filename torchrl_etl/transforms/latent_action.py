@@ -15,7 +15,13 @@ from torchrl.collectors import Collector
 from torchrl.data import Bounded, Composite, ReplayBuffer, TensorSpec
 from torchrl.envs.transforms import ModuleTransform, TransformedEnv
 
-from torchrl_etl.transforms.keys import check_network, private_key, set_leaf, set_where_reset
+from torchrl_etl.transforms.keys import (
+    check_network,
+    group_shape,
+    private_key,
+    set_leaf,
+    set_where_reset,
+)
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -39,7 +45,8 @@ class LatentAction(ModuleTransform):
     to the root, and leave ``action`` out. There the pair is root ``latent`` and
     ``("next", "executed_action")``, and before n-step returns
     ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)`` brings it to
-    the root.
+    the root. A replay buffer that several collectors share, or that a rollout is first put into,
+    has no root ``action`` either: append the same transform to it.
 
     The module is held by reference: changing its weights in place changes the next step. It is a
     submodule, so ``state_dict()`` holds it and attaching moves it to the env's device and to eval
@@ -152,6 +159,11 @@ class LatentAction(ModuleTransform):
     def decode(self, latent: Tensor) -> Tensor:
         """Actions [*, n] for latent actions [*, d], in the env's dtype."""
         batch_size = latent.shape[: latent.ndim - self.latent_spec.ndim]
+        if latent.shape != (*batch_size, *self.latent_spec.shape):
+            raise ValueError(
+                f"{self.latent_key!r} has shape {list(latent.shape)}; it must end with "
+                f"{list(self.latent_spec.shape)}."
+            )
         entry = self.module(TensorDict({self.module.in_keys[0]: latent}, batch_size))
         action = entry.get(self.module.out_keys[0])
         return action if self.parent is None else action.to(self._action_leaf.dtype)
@@ -195,11 +207,15 @@ class LatentAction(ModuleTransform):
         if isinstance(leaf, Bounded):
             rest = rest.clamp(leaf.space.low, leaf.space.high)
         # An env that is not batch-locked leaves the batch size to the data.
-        return rest.expand(*batch_size, *rest.shape[self.parent.ndim :]).clone()
+        return rest.expand((*batch_size, *rest.shape[self.parent.ndim :])).clone()
 
     @property
     def _action_leaf(self) -> TensorSpec:
         return self.parent.full_action_spec[self.action_key]
+
+    def _batch_size(self, leaf: TensorSpec) -> torch.Size:
+        scalar = leaf.ndim == len(group_shape(self.parent, self.action_key))
+        return leaf.shape if scalar else leaf.shape[:-1]
 
     @property
     def _base_key(self) -> NestedKey | None:
@@ -216,7 +232,8 @@ class LatentAction(ModuleTransform):
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         leaf = action_spec[self.action_key]
-        latent_spec = self.latent_spec.expand(*leaf.shape[:-1], *self.latent_spec.shape)
+        batch_size = self._batch_size(leaf)
+        latent_spec = self.latent_spec.expand((*batch_size, *self.latent_spec.shape))
         latent_spec = latent_spec.to(leaf.device or latent_spec.device)
         # In this order: a group that were empty for a moment would lose its batch size.
         set_leaf(action_spec, self.latent_key, latent_spec, self.parent)
@@ -281,10 +298,11 @@ class LatentAction(ModuleTransform):
         weights = [*self.module.parameters(), *self.module.buffers()]
         latent = self.latent_spec.zero()
         shape = self.decode(latent.to(weights[0].device) if weights else latent).shape
-        if shape != leaf.shape[-1:]:
+        own = leaf.shape[len(self._batch_size(leaf)) :]
+        if shape != own:
             raise ValueError(
                 f"The module makes actions of shape {list(shape)} but the env's "
-                f"{self.action_key!r} has {list(leaf.shape[-1:])}; use a module made for this env."
+                f"{self.action_key!r} has {list(own)}; use a module made for this env."
             )
 
 

@@ -87,6 +87,16 @@ class SynergyAction(LatentAction):
         """What the policy writes."""
         return self.latent_key
 
+    def decode(self, latent: Tensor) -> Tensor:
+        action = super().decode(latent)
+        if self.parent is None or not isinstance(leaf := self._action_leaf, Bounded):
+            return action
+        # In single precision, bounds are rounded too; those of all rows are the decoder's.
+        low, high = (
+            bound.reshape(-1, leaf.shape[-1])[0] for bound in (leaf.space.low, leaf.space.high)
+        )
+        return action.clamp(low, high)
+
     def __repr__(self) -> str:
         decoder = self.module
         return (
