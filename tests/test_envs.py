@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import ParallelEnv, check_env_specs, step_mdp
+from torchrl.envs import DMControlEnv, ParallelEnv, SerialEnv, check_env_specs, step_mdp
 
 from tests.planted_env import PLANTED
 from torchrl_etl.envs import actuator_names, episode_length, list_tasks, make_env
@@ -184,6 +184,13 @@ def test_batched_reset_takes_a_tensordict_without_mask():
     env = make_env("overactuated", num_envs=2, seed=0)
     td = env.reset(TensorDict({"direction": torch.ones(2, 3)}, batch_size=[2]))
     assert td["observation"].shape == (2, 6)
+
+
+def test_names_come_from_torchrl_s_own_dm_control_and_not_from_workers():
+    reacher = DMControlEnv("reacher", "easy")
+    assert actuator_names(reacher) == ["shoulder", "wrist"]
+    with pytest.raises(ValueError, match="A SerialEnv has its simulators in workers; pass the"):
+        actuator_names(SerialEnv(2, lambda: reacher))
 
 
 def test_discrete_actions_are_refused():

@@ -166,7 +166,9 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
             built.close()
     simulation = simulator(env)
     names = _raw_actuator_names(simulation)
-    count = math.prod(simulation.action_space.shape)
+    suited = hasattr(simulation, "action_space")  # else dm_control's own, in no Gymnasium wrapper
+    space = simulation.action_space if suited else simulation.action_spec()
+    count = math.prod(space.shape)
     if len(names) > count:  # the simulator itself drives the rest: a prosthesis, for one
         first = getattr(getattr(simulation, "model", None), "actuator_actadr", ())
         names = [name for name, at in zip(names, first, strict=False) if at >= 0]

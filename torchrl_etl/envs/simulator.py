@@ -6,7 +6,8 @@ import sys
 from typing import Any
 
 import gymnasium as gym
-from torchrl.envs import EnvBase, GymWrapper
+from torchrl.envs import DMControlWrapper, EnvBase, GymWrapper
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 __all__ = ["mujoco_state", "simulator"]
 
@@ -24,6 +25,13 @@ def simulator(env: EnvBase | gym.Env | gym.vector.VectorEnv) -> Any:
             env = env.unwrapped.envs[0]
         elif isinstance(env, GymWrapper):
             env = env._env
+        elif isinstance(env, DMControlWrapper):
+            return env._env
+        elif isinstance(env, BatchedEnvBase):
+            raise ValueError(
+                f"A {type(env).__name__} has its simulators in workers; pass the environment of "
+                "one worker."
+            )
         elif hasattr(env, "base_env"):
             env = env.base_env
         else:
