@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from scipy.stats import kstest
 from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, TruncatedNormal
 
 from torchrl_etl.modules import HeldNoise, make_actor
 
@@ -76,3 +80,30 @@ def test_its_memory_is_no_part_of_its_state():
     keys = set(held.state_dict())
     step(held, True)
     assert set(held.state_dict()) == keys
+
+
+def actor_of(kind: type) -> ProbabilisticActor:
+    network = nn.Sequential(nn.Linear(3, 4), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=kind,
+        return_log_prob=True,
+    )
+
+
+@pytest.mark.parametrize("kind", [IndependentNormal, TruncatedNormal])
+def test_an_actor_without_a_tanh_gaussian_is_refused(kind: type):
+    with pytest.raises(ValueError, match=f"draws from {kind.__name__}; noise is held in a Tanh"):
+        HeldNoise(actor_of(kind))
+
+
+def test_out_keys_are_what_is_written():
+    held = HeldNoise(actor_of(TanhNormal))
+    data = TensorDict({"observation": torch.ones(2, 3), "is_init": torch.ones(2, 1).bool()}, [2])
+    assert set(held.out_keys) == set(held(data.clone()).keys()) - set(data.keys())
+
+
+def test_data_that_does_not_say_where_episodes_begin_are_one_sentence():
+    with pytest.raises(KeyError, match=r"'is_init', which the data lacks.* an InitTracker\(\)"):
+        policy()(TensorDict({"observation": torch.ones(2, 3)}, [2]))

@@ -6,6 +6,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import TanhNormal
 
 from torchrl_etl.modules.lasting_noise import HeldNormal
 
@@ -34,10 +35,11 @@ class HeldNoise(TensorDictModuleBase):
         init_key (NestedKey): see :class:`torchrl.envs.InitTracker`. Default: ``"is_init"``.
 
     Keys:
-        reads the actor's, and ``is_init`` [*, 1], where noise is drawn anew; writes the actor's.
+        reads the actor's, and ``is_init`` [*, 1], where noise is drawn anew; writes the actor's,
+        but for a log-probability.
 
     Raises:
-        ValueError: if exponent or longest are not positive.
+        ValueError: if exponent or longest are not positive, or the actor is no tanh-Gaussian.
 
     Examples:
         >>> import torch
@@ -58,17 +60,29 @@ class HeldNoise(TensorDictModuleBase):
         longest: int = 16,
         init_key: NestedKey = "is_init",
     ) -> None:
+        kind = actor[-1].distribution_class
+        if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
+            raise ValueError(
+                f"The actor draws from {getattr(kind, '__name__', kind)}; noise is held in a "
+                "TanhNormal, such as make_actor's."
+            )
         super().__init__()
         self.actor, self.init_key = actor, init_key
         self.in_keys = [*actor.in_keys, init_key]
-        self.out_keys = list(actor.out_keys)
+        self.out_keys = [key for key in actor.out_keys if key not in actor.log_prob_keys]
         self._draw = HeldNormal(longest, exponent)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return self.actor(tensordict)
         distribution = self.actor.get_dist(tensordict)
-        noise = self._draw(distribution.loc, tensordict.get(self.init_key).squeeze(-1))
+        begins = tensordict.get(self.init_key, None)
+        if begins is None:
+            raise KeyError(
+                f"HeldNoise reads {self.init_key!r}, which the data lacks; give the environment an "
+                "InitTracker()."
+            )
+        noise = self._draw(distribution.loc, begins.squeeze(-1))
         action = distribution.loc + distribution.scale * noise
         for transform in distribution.transforms:
             action = transform(action)
