@@ -118,10 +118,6 @@ def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
 
     Raises:
         ValueError: if the spec is another, or its range is not finite.
-
-    Examples:
-        >>> bounds_of(Bounded(0, 1, shape=(2,)))
-        (tensor([0., 0.]), tensor([1., 1.]))
     """
     if isinstance(action_spec, Bounded):
         low, high = action_spec.space.low, action_spec.space.high

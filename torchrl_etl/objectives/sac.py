@@ -142,14 +142,11 @@ class LeanSACLoss(SACLoss):
         super().set_keys(**kwargs)
         self._value_key = value_key(self.qvalue_network, self.tensor_keys.state_action_value)
 
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> SACLoss | None:
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
         """See :meth:`torchrl.objectives.SACLoss.make_value_estimator`.
 
         Raises:
-            ValueError: for another estimator than TD0 with a ``support``: a target of many steps
-                is a value, and what a distribution of the return needs is a step's.
+            ValueError: for another estimator than TD0 with a ``support``.
         """
         if self.support is not None and value_type not in (None, ValueEstimators.TD0):
             raise ValueError(

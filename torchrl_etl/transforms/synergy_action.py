@@ -92,10 +92,8 @@ class SynergyAction(LatentAction):
         if self.parent is None or not isinstance(leaf := self._action_leaf, Bounded):
             return action
         # In single precision, bounds are rounded too; those of all rows are the decoder's.
-        low, high = (
-            bound.reshape(-1, leaf.shape[-1])[0] for bound in (leaf.space.low, leaf.space.high)
-        )
-        return action.clamp(low, high)
+        row = (0,) * (leaf.ndim - 1)
+        return action.clamp(leaf.space.low[row], leaf.space.high[row])
 
     def __repr__(self) -> str:
         decoder = self.module
