@@ -18,6 +18,7 @@ from tests.stages import changed, fill, goes_on_after_a_load, prepared, snapshot
 from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.exploration import Exploration
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
@@ -66,6 +67,13 @@ class Learned(SynergyModel):
 
     def reconstruct(self, actions):
         return self.loss.rebuild(actions)
+
+
+class Embedding(Exploration):
+    """Where a transition ends, beside where it begins."""
+
+    def embed(self, rows):
+        return rows["next", "observation"], rows["observation"]
 
 
 class NoBundle(Learned):
@@ -119,6 +127,22 @@ def test_a_model_with_a_loss_goes_through_both_stages_with_its_pictures(tmp_path
     assert load_bundle(tmp_path / "run")[1].kind == "learned"
     drawn = {file.name for file in (tmp_path / "run" / "pictures").iterdir()}
     assert drawn >= {"synergies.png", "vaf.png", "embedding.png"}
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_what_an_exploration_embeds_of_whole_transitions_is_told_or_why_not(
+    fails, tmp_path, monkeypatch
+):
+    def embed(self, rows):
+        raise KeyError("phase")
+
+    if fails:
+        monkeypatch.setattr(Embedding, "embed", embed)
+    config, said = tiny(f"run_dir='{tmp_path}/run'", "stage=explore", *BRIEF), []
+    config.exploration = {"kind": "tests.test_extend:Embedding"}
+    found = Experiment(config, say=said.append).run()["synergies"]
+    assert ("direction_alignment" in found) is not fails
+    assert any("could not embed its transitions (KeyError('phase'))" in s for s in said) is fails
 
 
 def test_a_model_whose_decoder_no_bundle_holds_is_refused_before_stage_1(tmp_path):

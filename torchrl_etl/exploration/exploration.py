@@ -66,5 +66,5 @@ class Exploration:
         return policy
 
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor] | None:
-        """Embeddings [*, k] and directions [*, k] of observations, if it has any."""
+        """Embeddings [*, k] and directions [*, k] of transitions as the buffer has them, if any."""
         return None
