@@ -23,6 +23,7 @@ def check_imported(name: object, source: str, error: type[ValueError], remedy: s
     trusts the module, ``remedy``.
 
     Examples:
+        >>> import fractions
         >>> check_imported("fractions:Fraction", "The task of my_file", ValueError, "import it")
         >>> check_imported("fractals:T-v0", "The task of my_file", ValueError, "import it")
         Traceback (most recent call last):
