@@ -50,7 +50,7 @@ def main(config: DictConfig) -> None:
         if config.part == "synergies":
             print(f"Synergies of {trained.env}, for synergies=zoo:{copy_bundle(run, target)}")
             return
-        card = export_run(run, target, compose, episodes=config.episodes)
+        card = export_run(run, target, compose, CONF, episodes=config.episodes)
     size = sum(path.stat().st_size for path in target.iterdir())
     print(f"{trained.env}{task.goal_in_words}, {card.training['frames']:,} frames")
     print_intervals(card.evaluation)

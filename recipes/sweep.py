@@ -27,6 +27,7 @@ from torchrl_etl.checks import check_choice, check_flag, check_integer
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
 from torchrl_etl.layout import available_cores
+from torchrl_etl.own_conf import group_files
 from torchrl_etl.training import Run, Sweep, validate
 
 HERE = Path(__file__).parent
@@ -73,7 +74,7 @@ def main(config: DictConfig) -> None:
 
 def queue(config: DictConfig) -> list[Run]:
     """The runs that a configuration asks for, seed by seed: early results of methods compare."""
-    methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+    methods = sorted(group_files(CONF, "method"))
     for name in ("tasks", "methods", "seeds"):
         value = config[name]
         if not isinstance(value, ListConfig) or not value:

@@ -12,6 +12,7 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.command_line import translate
+from torchrl_etl.own_conf import group_files
 from torchrl_etl.training.resumed import parse_override
 
 ROOT = Path(__file__).parent.parent
@@ -62,16 +63,22 @@ RESIDUAL = (
 )
 
 
-def tiny(*overrides: str, name: str = "config", conf: Path = CONF) -> DictConfig:
+def tiny(*overrides: str, name: str = "config") -> DictConfig:
     """The tiny configuration with overrides, of those settings that the chosen kinds have."""
-    small = [setting for setting in TINY if _is_there(setting, overrides, conf)]
-    given = [parse_override(override) for override in translate(overrides, conf)]
-    kinds = [override for override in given if not _is_value(override, conf)]
-    config = deepcopy(_composed(conf, name, *small, *(kind.input_line for kind in kinds)))
+    small = [setting for setting in TINY if _is_there(setting, overrides)]
+    given = [parse_override(override) for override in translate(overrides, CONF)]
+    kinds = [override for override in given if not _is_value(override)]
+    config = deepcopy(_composed(name, *small, *(kind.input_line for kind in kinds)))
     for override in given:
         if override not in kinds:
             OmegaConf.update(config, override.key_or_group, override.value())
     return config
+
+
+def composed(overrides: Sequence[str] = ()) -> DictConfig:
+    """What a recipe makes of Hydra's overrides."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
 
 
 def rival(method: str, run: Path, *overrides: str) -> DictConfig:
@@ -80,25 +87,25 @@ def rival(method: str, run: Path, *overrides: str) -> DictConfig:
     return tiny(ELBOW, f"method={method}", "frames=608", f"run_dir='{run}'", *brief, *overrides)
 
 
-def _is_value(override: Override, conf: Path) -> bool:
+def _is_value(override: Override) -> bool:
     """Whether an override gives a setting that is there another value, and chooses no file."""
     plain = override.type is OverrideType.CHANGE
-    return plain and not (conf / override.key_or_group).is_dir()
+    return plain and not (CONF / override.key_or_group).is_dir()
 
 
 @cache  # composing takes a quarter of a second
-def _composed(conf: Path, name: str, *overrides: str) -> DictConfig:
-    with initialize_config_dir(str(conf), version_base="1.3"):
-        return compose(name, overrides=[*translate(overrides, conf)])
+def _composed(name: str, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(name, overrides=[*translate(overrides, CONF)])
 
 
-def _is_there(setting: str, overrides: Sequence[str], conf: Path) -> bool:
+def _is_there(setting: str, overrides: Sequence[str]) -> bool:
     section, _, key = setting.partition("=")[0].partition(".")
     given = {name: value for name, _, value in (o.partition("=") for o in overrides)}
     kind = given.get(section)
     if kind is None and (method := given.get("method")):  # which may bring one
-        for default in OmegaConf.load(conf / "method" / f"{method}.yaml").get("defaults", ()):
+        for default in OmegaConf.load(group_files(CONF, "method")[method]).get("defaults", ()):
             kind = default.get(f"override /{section}", kind)
-    if not key or kind is None or not (file := conf / section / f"{kind}.yaml").is_file():
+    if not key or (file := group_files(CONF, section).get(kind)) is None:
         return True
     return OmegaConf.select(OmegaConf.load(file), key) is not None

@@ -70,7 +70,7 @@ def commands(page: Path) -> list[tuple[str, list[str]]]:
 
 
 @pytest.mark.parametrize(
-    # extend.md gives files to recipes/conf, on which its commands build.
+    # extend.md has files of its own, on which its commands build.
     "page",
     [page for page in PAGES if commands(page) and name_of(page) != "docs/extend.md"],
     ids=name_of,

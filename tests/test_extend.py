@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
+import shlex
 import sys
 
 import pytest
@@ -13,12 +13,14 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import LossModule
 
-from tests.configs import CONF, ROOT, tiny
+from tests.commands import command
+from tests.configs import CONF, ROOT, composed, tiny
 from tests.stages import changed, fill, goes_on_after_a_load, prepared, snapshot
 from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.exploration import Exploration
+from torchrl_etl.export import command_of
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
@@ -84,14 +86,14 @@ class NoBundle(Learned):
 
 
 @pytest.fixture
-def conf(tmp_path, monkeypatch):
+def own(tmp_path, monkeypatch):
     """The page's files in a folder of their own, which is the current one."""
-    shutil.copytree(CONF, tmp_path / "recipes" / "conf")
     for name, content in FILES.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    yield tmp_path / "recipes" / "conf"
+    yield
     for module in MODULES:
         sys.modules.pop(module, None)
 
@@ -100,17 +102,17 @@ def test_the_page_has_one_short_python_file_and_one_yaml_file_for_each():
     python = {name: code for name, code in FILES.items() if name.endswith(".py")}
     assert set(python) == {f"{module}.py" for module in MODULES}
     assert set(FILES) - set(python) == {
-        "recipes/conf/exploration/curiosity.yaml",
-        "recipes/conf/synergies/random.yaml",
-        "recipes/conf/method/thrift.yaml",
+        "conf/exploration/curiosity.yaml",
+        "conf/synergies/random.yaml",
+        "conf/method/thrift.yaml",
     }
     for name, code in python.items():
         assert sum(bool(line.strip()) for line in code.splitlines()) < 40, name
 
 
-def test_both_stages_run_with_the_toys(conf, tmp_path):
+def test_both_stages_run_with_the_toys(own, tmp_path):
     settings = ("learn.prefill=true", "learn.decoder.residual=0.5", *BRIEF)
-    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings, conf=conf)).run()
+    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings)).run()
     assert summary["learn"]["frames"] == 64
     assert load_bundle(tmp_path / "run")[1].kind == "random"
 
@@ -152,15 +154,15 @@ def test_a_model_whose_decoder_no_bundle_holds_is_refused_before_stage_1(tmp_pat
     assert not (tmp_path / "run").exists()
 
 
-def test_stage_1_of_the_toys_goes_on_after_a_kill_with_the_same_numbers(conf, tmp_path):
+def test_stage_1_of_the_toys_goes_on_after_a_kill_with_the_same_numbers(own, tmp_path):
     def make():
-        return Explorer(Experiment(tiny("run_dir=unused", *OWN, conf=conf)).context).stage
+        return Explorer(Experiment(tiny("run_dir=unused", *OWN)).context).stage
 
     assert goes_on_after_a_load(make, tmp_path)
 
 
-def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(conf):
-    found = Explorer(Experiment(tiny("run_dir=unused", *OWN, conf=conf)).context)
+def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(own):
+    found = Explorer(Experiment(tiny("run_dir=unused", *OWN)).context)
     found.stage.restart_collection()
     for _ in range(6):
         found.stage.collect()
@@ -174,7 +176,7 @@ def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(conf):
     found.stage.close()
 
 
-def test_the_toy_synergies_fit_recordings_worse_than_nmf(conf, tmp_path, capsys):
+def test_the_toy_synergies_fit_recordings_worse_than_nmf(own, tmp_path, capsys):
     code = compile(FILES["recordings.py"], "recordings.py", "exec")
     sys.path.append(str(tmp_path))
     exec(code, {"__name__": "__main__"})
@@ -182,20 +184,20 @@ def test_the_toy_synergies_fit_recordings_worse_than_nmf(conf, tmp_path, capsys)
     assert nmf > 0.99 > at_random > 0
 
 
-def test_the_toy_method_runs_and_goes_on_after_a_kill_with_the_same_numbers(conf, tmp_path):
+def test_the_toy_method_runs_and_goes_on_after_a_kill_with_the_same_numbers(own, tmp_path):
     def make():
-        return Experiment(tiny("run_dir=unused", "method=thrift", conf=conf)).method.stage()
+        return Experiment(tiny("run_dir=unused", "method=thrift")).method.stage()
 
     assert goes_on_after_a_load(make, tmp_path)
     settings = ("method=thrift", "learn.frames=96", "evaluation.episodes=1")
-    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings, conf=conf)).run()
+    summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings)).run()
     assert summary["learn"]["frames_charged"] == 96
     assert resumed_config(tmp_path / "run").method.kind == "thrift:Thrift"
 
 
-def test_the_toy_method_learns_on_the_reward_less_the_effort(conf):
+def test_the_toy_method_learns_on_the_reward_less_the_effort(own):
     asked = ("method=thrift", "method.options.price=2")
-    stage = Experiment(tiny("run_dir=unused", *asked, conf=conf)).method.stage()
+    stage = Experiment(tiny("run_dir=unused", *asked)).method.stage()
     stage.restart_collection()
     fill(stage)
     batch = stage.sample()
@@ -217,20 +219,36 @@ def test_the_toy_method_learns_on_the_reward_less_the_effort(conf):
         ("kind", None, r"method\.kind is None; choose one of etl, sac, lattice"),
     ],
 )
-def test_a_method_that_cannot_be_had_is_one_sentence(key, value, words, conf):
-    config = tiny("run_dir=unused", "method=thrift", conf=conf)
+def test_a_method_that_cannot_be_had_is_one_sentence(key, value, words, own):
+    config = tiny("run_dir=unused", "method=thrift")
     OmegaConf.update(config, f"method.{key}", value, force_add=True)
     with pytest.raises(ValueError, match=words):
         Experiment(config)
 
 
-def test_the_command_line_knows_kinds_that_have_a_file(conf):
+def test_the_command_line_knows_kinds_that_have_a_file(own):
     settings = ("exploration.lr=0.1", "synergies.seed=3", "method=thrift", "method.options.price=1")
-    check_overrides(conf / "config.yaml", [*OWN, *settings], "")
-    assert translate(["synergies=random"], conf) == ["synergies=random"]
-    assert translate(["exploration.kind=a:B"], conf) == ["exploration.kind=a:B"]
+    check_overrides(CONF / "config.yaml", [*OWN, *settings], "")
+    assert translate(["synergies=random"], CONF) == ["synergies=random"]
+    assert translate(["exploration.kind=a:B"], CONF) == ["exploration.kind=a:B"]
     kinds = ["method.kind=a:B", "method.kind=sar"]
-    assert translate(kinds, conf) == ["method.kind=a:B", "method=sar"]
+    assert translate(kinds, CONF) == ["method.kind=a:B", "method=sar"]
+
+
+def test_a_recipe_finds_the_files_of_one_s_own_and_their_settings(own, capsys):
+    assert command("etl_sac.py", *OWN, "method=thrift", "synergies.seed=3", "--cfg=job") == 0
+    config = OmegaConf.create(capsys.readouterr().out)
+    kinds = [config[group].kind for group in ("exploration", "synergies", "method")]
+    assert kinds == ["curiosity:Curiosity", "at_random:RandomSynergies", "thrift:Thrift"]
+    assert command("etl_sac.py", "exploration=curiosity", "--help") == 0
+    assert "exploration:   # exploration=curiosity\n  kind: curiosity" in capsys.readouterr().out
+
+
+def test_the_command_of_a_run_names_the_files_of_one_s_own_and_can_be_run(own):
+    made = tiny("run_dir=unused", *OWN, "exploration.lr=0.1")
+    told = shlex.split(command_of(made, composed, CONF, "toy"))[2:]
+    assert {*OWN, "exploration.lr=0.1"} < {*told}
+    check_overrides(CONF / "config.yaml", told, "")
 
 
 @pytest.mark.parametrize(
@@ -242,19 +260,19 @@ def test_the_command_line_knows_kinds_that_have_a_file(conf):
         ("curiosity", ValueError, r"exploration\.kind is 'curiosity'; choose one of metric, metra"),
     ],
 )
-def test_a_kind_that_is_not_there_is_one_sentence(kind, error, words, conf):
-    config = tiny("run_dir=unused", *OWN, conf=conf)
+def test_a_kind_that_is_not_there_is_one_sentence(kind, error, words, own):
+    config = tiny("run_dir=unused", *OWN)
     config.exploration.kind = kind
     with pytest.raises(error, match=words):
         Explorer(Experiment(config).context)
 
 
-def test_a_kind_of_one_s_own_without_its_file_is_told_to_get_one(conf):
-    config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity", conf=conf)
-    with pytest.raises(ValueError, match=r"a file of its own in recipes/conf/exploration\.$"):
+def test_a_kind_of_one_s_own_without_its_file_is_told_to_get_one(own):
+    config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity")
+    with pytest.raises(ValueError, match=r"a file of its own in \./conf/exploration\.$"):
         Explorer(Experiment(config).context)
 
 
-def test_fit_synergies_takes_a_class_of_one_s_own_by_its_name(conf):
+def test_fit_synergies_takes_a_class_of_one_s_own_by_its_name(own):
     model = fit_synergies(torch.rand(50, 6), "at_random:RandomSynergies", 2, seed=3)
     assert (model.kind, model.seed) == ("random", 3)

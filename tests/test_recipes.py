@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -138,6 +139,9 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
     ("recipe", "override", "words"),
     [
         ("etl_sac.py", "method=latice", "nearest: lattice"),
+        ("etl_sac.py", "method=pink", ", or give it a file of its own in ./conf/method."),
+        ("etl_sac.py", "method.options.frames=5", "with method=etl there is no setting 'method.o"),
+        ("etl_sac.py", "+exploration.std=5", "with exploration=metric there is no setting 'expl"),
         ("etl_sac.py", "enf=myoHandPose", "did you mean env"),
         ("etl_sac.py", "learn.frame=3", "learn.frames"),
         ("etl_sac.py", "env=myoHandPos", "myoHandPose"),
@@ -247,6 +251,12 @@ def test_help_explains_the_settings(capsys):
     said = capsys.readouterr().out
     for word in ("stage", "synergies", "faithful", "resume", "num_envs", "kl_weight", "epsilon"):
         assert word in said
+
+
+def test_help_that_nobody_reads_to_its_end_leaves_without_a_word():
+    recipe = shlex.join([sys.executable, str(ROOT / "recipes" / "etl_sac.py")])
+    done = subprocess.run(f"{recipe} --help | true", shell=True, capture_output=True, text=True)
+    assert "BrokenPipeError" not in done.stderr
 
 
 @pytest.mark.slow

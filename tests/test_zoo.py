@@ -10,13 +10,12 @@ import shutil
 import pytest
 import safetensors.torch
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.commands import command
-from tests.configs import BRIEFLY, CONF, ELBOW, ROOT, tiny
+from tests.configs import BRIEFLY, CONF, ELBOW, ROOT, composed, tiny
 from torchrl_etl import zoo
 from torchrl_etl.command_line import translate
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
@@ -26,11 +25,6 @@ from torchrl_etl.opened import open_zoo
 from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training import Evaluation, evaluate_task, resumed_config, validate
 from torchrl_etl.zoo import ZooError
-
-
-def composed(overrides=()):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +38,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def exported(run):
     """An entry of it."""
-    export_run(run, run.parent / "toy", composed, episodes=3)
+    export_run(run, run.parent / "toy", composed, CONF, episodes=3)
     return run.parent / "toy"
 
 
@@ -199,7 +193,7 @@ def test_a_method_that_does_not_tell_of_its_actor_is_one_sentence(monkeypatch):
 )
 def test_the_command_on_a_card_makes_the_same_configuration(overrides):
     made = tiny("run_dir=unused", *overrides)
-    told = shlex.split(command_of(made, composed, "toy"))
+    told = shlex.split(command_of(made, composed, CONF, "toy"))
     assert told[:2] == ["python", "recipes/etl_sac.py"]
     again = composed(translate(told[2:], CONF))
     assert place_aside(again) == place_aside(made)
@@ -227,14 +221,14 @@ def place_aside(config) -> dict:
 def test_given_synergies_are_those_of_the_entry(exported):
     made = tiny("run_dir=unused", f"synergies=zoo:{exported}")
     assert Experiment(made).config.num_synergies == 2
-    assert "synergies=zoo:toy" in command_of(made, composed, "toy")
-    assert str(exported) not in command_of(made, composed, "toy")
+    assert "synergies=zoo:toy" in command_of(made, composed, CONF, "toy")
+    assert str(exported) not in command_of(made, composed, CONF, "toy")
 
 
 @pytest.mark.parametrize("choice", ["synergies=zoo:{}", "method=sac", "method=lattice"])
 def test_the_command_of_a_run_that_explored_nothing_makes_the_same_configuration(choice, exported):
     made = Experiment(tiny("run_dir=unused", choice.format(exported))).config
-    told = shlex.split(command_of(made, composed, exported))
+    told = shlex.split(command_of(made, composed, CONF, exported))
     again = Experiment(composed(translate([*told[2:], "run_dir=unused"], CONF))).config
     assert place_aside(again) == place_aside(made)
 
@@ -289,7 +283,7 @@ def test_a_policy_is_refused_on_another_body(exported):
 def test_an_entry_does_not_replace_what_is_none(run, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(ZooError, match=r"holds 'thesis.tex'"):
-        export_run(run, tmp_path, composed, episodes=1)
+        export_run(run, tmp_path, composed, CONF, episodes=1)
     assert (tmp_path / "thesis.tex").exists()
 
 

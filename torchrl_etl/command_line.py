@@ -19,11 +19,15 @@ import gymnasium
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
+from torchrl_etl.own_conf import group_files
 from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED, quoted
 from torchrl_etl.training.resumed import check_prefix, parse_override
 
 with extra("recipes"):
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
     from omegaconf import DictConfig, OmegaConf
+    from yaml import YAMLError
 
 __all__ = [
     "OPENING_FAULTS",
@@ -45,49 +49,52 @@ def check_overrides(
 ) -> None:
     """Answer ``--help``, and leave with the nearest key if an override names none that exists.
 
-    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing. A
-    plus in front of a key is no way around: nothing would read what it adds, but in the sections
-    that are handed on to another library.
+    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing. What
+    exists depends on the files that are chosen: each kind has options of its own. A plus in front
+    of a key is no way around: nothing would read what it adds, but in the sections that are handed
+    on to another library.
 
     ``config`` is the primary YAML file, beside which folders are groups, and ``usage`` what the
     help begins with; ``short`` are ways to write a setting that the recipe has translated already,
     to be suggested like the rest.
     """
     text = config.read_text(encoding="utf-8")
-    if {"-h", "--help"} & set(arguments):
-        settings, _, _ = text.partition("\nhydra:")
-        print(usage.strip(), settings, *_of_groups(config), sep="\n\n")
-        sys.exit()
-    known = list(_keys(OmegaConf.create(text)))
     defaults = OmegaConf.create(text).get("defaults", [])
-    choices: dict[str, list[str]] = {}
-    for group in [name for entry in defaults if isinstance(entry, DictConfig) for name in entry]:
-        known.append(group)
-        files = sorted((config.parent / group).glob("*.yaml"))
-        choices[group] = [path.stem for path in files]
-        for choice in files:
-            prefix = "" if "@package _global_" in choice.read_text("utf-8") else f"{group}."
-            known += _keys(OmegaConf.load(choice), prefix)
+    groups = [name for entry in defaults if isinstance(entry, DictConfig) for name in entry]
+    chosen = []
     for argument in arguments:
-        key, separator, value = argument.partition("=")
+        key, separator, value = argument.lstrip("+").partition("=")
+        if key in groups and separator:
+            with one_sentence(ValueError):
+                _check_file(config.parent, key, value)
+            chosen.append(f"{key}={value}")
+    with one_sentence(HydraException, YAMLError):
+        settings, choices = _composed(config, chosen)
+    if {"-h", "--help"} & set(arguments):
+        own, _, _ = text.partition("\nhydra:")
+        _print(usage.strip(), own, *_of_groups(config.parent, groups, choices))
+        sys.exit()
+    known = [*_keys(settings), *groups]
+    for argument in arguments:
+        key, separator, _ = argument.partition("=")
         key = key.lstrip("+~")
+        section = key.partition(".")[0]
         if argument in ("-m", "--multirun"):
             sys.exit(
                 f"Error: {argument} is not supported; recipes/sweep.py runs several, such as "
                 "methods=[sac,etl] seeds=[0,1], side by side, and goes on if it is interrupted."
             )
-        if argument.startswith("-") or key.partition(".")[0] == "hydra" or key.startswith("hydra/"):
+        if argument.startswith("-") or section == "hydra" or key.startswith("hydra/"):
             continue
         if not separator and not argument.startswith("~"):
             sys.exit(f"Error: {argument!r} is not of the form key=value; see --help.")
-        if key not in known and key.split(".")[0] not in OPEN_SECTIONS:
+        if key not in known and section not in OPEN_SECTIONS:
             near = difflib.get_close_matches(key, list(dict.fromkeys([*known, *short])), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
-            sys.exit(f"Error: there is no setting {key!r}; {hint}")
+            of = f"with {section}={choices[section]} " if section in groups else ""
+            sys.exit(f"Error: {of}there is no setting {key!r}; {hint}")
         with one_sentence(ValueError):
             check_prefix(parse_override(argument), key in known)
-            if choices.get(key):
-                check_choice(key, value, choices[key])
 
 
 def translate(arguments: Sequence[str], groups: Path) -> list[str]:
@@ -117,7 +124,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         name = key.lstrip("+~")
         if (old := _former(name)) is not None:
             raise ValueError(f"{name} is called {RENAMED[old]}{name.removeprefix(old)} now.")
-        kinds = {path.stem for path in (groups / "synergies").glob("*.yaml")}
+        kinds = group_files(groups, "synergies")
         if name in ("synergies.kind", "exploration.kind", "method.kind") and ":" not in value:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:
@@ -188,13 +195,37 @@ def quiet_torchrl() -> None:
     warnings.formatwarning = lambda message, *place, **source: f"Warning: {message}\n"
 
 
-def _of_groups(config: Path) -> Iterator[str]:
-    """The settings of the files that the defaults choose, each as the section that it fills."""
-    for entry in OmegaConf.load(config).get("defaults", []):
-        for group, choice in entry.items() if isinstance(entry, DictConfig) else ():
-            if choice is not None and (file := config.parent / group / f"{choice}.yaml").is_file():
-                inner = textwrap.indent(file.read_text(encoding="utf-8").rstrip(), "  ")
-                yield f"{group}:   # {group}={choice}\n{inner}"
+def _check_file(conf: Path, group: str, choice: str) -> None:
+    files = group_files(conf, group)
+    try:
+        check_choice(group, choice, list(files))
+    except ValueError as error:
+        said = str(error).removesuffix(".")
+        raise ValueError(f"{said}, or give it a file of its own in ./conf/{group}.") from None
+
+
+def _composed(config: Path, chosen: list[str]) -> tuple[DictConfig, Mapping[str, str]]:
+    """All settings there are with these files of groups, and the file of each group."""
+    with initialize_config_dir(str(config.parent.resolve()), version_base="1.3"):
+        settings = compose(config.stem, chosen, return_hydra_config=True)
+    OmegaConf.set_struct(settings, False)
+    return settings, settings.pop("hydra").runtime.choices
+
+
+def _print(*parts: str) -> None:
+    """Print with blank lines between, also to a pipe that is closed before the end, as of head."""
+    try:
+        print(*parts, sep="\n\n", flush=True)
+    except BrokenPipeError:  # what is left would be tried again at the exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _of_groups(conf: Path, groups: list[str], choices: Mapping[str, str]) -> Iterator[str]:
+    """The settings of the files that were chosen, each as the section that it fills."""
+    for group in groups:
+        if (file := group_files(conf, group).get(choices.get(group))) is not None:
+            inner = textwrap.indent(file.read_text(encoding="utf-8").rstrip(), "  ")
+            yield f"{group}:   # {group}={choices[group]}\n{inner}"
 
 
 def _keys(config: DictConfig, prefix: str = "") -> Iterator[str]:

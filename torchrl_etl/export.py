@@ -15,13 +15,13 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.extras import extra
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.learners import SACLearner
+from torchrl_etl.own_conf import group_files
 from torchrl_etl.training import evaluate_task, resumed_config
 from torchrl_etl.training.config import quoted
 from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.zoo import Card, describe_decoder, make_policy, save_entry
 
 with extra("recipes"):
-    from hydra.errors import HydraException
     from omegaconf import DictConfig, OmegaConf
 
 __all__ = ["command_of", "describe_policy", "export_run", "rebuilt"]
@@ -41,7 +41,9 @@ _OF_THE_PLACE = ("run_dir", "resume", "log", "logger_kwargs", "log_every", "prog
 _OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed")
 
 
-def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50) -> Card:
+def export_run(
+    run: Path, target: Path, compose: Compose, groups: Path, *, episodes: int = 50
+) -> Card:
     """Evaluate the policy of a run and write it as an entry of the zoo; returns its card.
 
     The policy that is evaluated is the one that was built again from the card.
@@ -50,6 +52,7 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
         run (path): the run folder.
         target (path): the entry's folder; its name is the entry's.
         compose (callable): a configuration from Hydra's overrides.
+        groups (path): the folder of its groups.
 
     Keyword Args:
         episodes (int): of the evaluation.
@@ -76,7 +79,7 @@ def export_run(run: Path, target: Path, compose: Compose, *, episodes: int = 50)
             "seed": experiment.config.seed,
             "commit": starts[-1].pop("commit", None),
             "versions": starts[-1],
-            "command": command_of(experiment.config, compose, target.name),
+            "command": command_of(experiment.config, compose, groups, target.name),
         },
         evaluation=result.summary(),
     )
@@ -119,7 +122,7 @@ def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDi
     return again.to(torch.device("cpu"))
 
 
-def command_of(config: DictConfig, compose: Compose, name: str) -> str:
+def command_of(config: DictConfig, compose: Compose, groups: Path, name: str) -> str:
     """The command whose configuration is this one, but for what concerns place and display; the
     synergies of the entry of this name stand for those that the run was given.
     """
@@ -131,9 +134,8 @@ def command_of(config: DictConfig, compose: Compose, name: str) -> str:
             unread.add(group)
         if kind is None or OmegaConf.select(compose(chosen), key) == kind:
             continue
-        with suppress(HydraException):  # of one's own, in a file that is not here
-            compose([*chosen, f"{group}={kind}"])
-            chosen.append(f"{group}={kind}")
+        files = group_files(groups, group).items()
+        chosen += [f"{group}={choice}" for choice, file in files if _says(file, key) == kind][:1]
     base, mine = (OmegaConf.to_container(of) for of in (compose(chosen), config))
     words = [f"env={config.env}", *chosen]
     if config.synergies.bundle is not None:
@@ -143,6 +145,12 @@ def command_of(config: DictConfig, compose: Compose, name: str) -> str:
         if key not in ("env", shared) and key.partition(".")[0] not in unread:
             words.append(f"{key}={value}")
     return shlex.join(["python", "recipes/etl_sac.py", *words])
+
+
+def _says(file: Path, key: str) -> Any:
+    """A setting in a file of a group, which writes it in full or as one of its own."""
+    content = OmegaConf.load(file)
+    return OmegaConf.select(content, key, default=content.get(key.rpartition(".")[2]))
 
 
 def _differences(base: dict, mine: dict, prefix: str = "") -> Iterator[tuple[str, str]]:

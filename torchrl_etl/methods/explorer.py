@@ -166,7 +166,7 @@ def _make(
             raise
         cure = f"choose {section}={kind}, which brings its own"
         if kind not in kinds:
-            cure = f"give this kind a file of its own in recipes/conf/{section}"
+            cure = f"give this kind a file of its own in ./conf/{section}"
         raise ValueError(
             f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
             f"{cure}."

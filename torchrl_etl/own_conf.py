@@ -1,0 +1,38 @@
+"""A user's own YAML files: the folder ``conf`` in the folder that a command is started from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchrl_etl.extras import extra
+
+with extra("recipes"):
+    from hydra.core.config_search_path import ConfigSearchPath
+    from hydra.core.plugins import Plugins
+    from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+__all__ = ["group_files"]
+
+OWN = Path("conf")
+
+
+def group_files(groups: Path, group: str) -> dict[str, Path]:
+    """Files that may be chosen of a group, by name: the recipes' in ``groups``, and one's own.
+
+    Examples:
+        >>> sorted(group_files(Path("recipes/conf"), "learner"))
+        ['plain']
+    """
+    files = (file for conf in (OWN, groups) for file in sorted((conf / group).glob("*.yaml")))
+    return {file.stem: file for file in files}  # the recipes' go first, for Hydra as well
+
+
+class _OwnFolder(SearchPathPlugin):
+    """Lets Hydra look there last, wherever a configuration is composed."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        if OWN.is_dir():
+            search_path.append("torchrl_etl", OWN.resolve().as_uri())
+
+
+Plugins.instance().register(_OwnFolder)
