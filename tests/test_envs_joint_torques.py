@@ -7,9 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from torchrl.envs import GymWrapper
 
 from torchrl_etl.analysis import joint_effects
 from torchrl_etl.envs import excitation, joint_torques, make_env, mujoco_state
+from torchrl_etl.envs.muscles import sends_sigmoid
+from torchrl_etl.envs.wrappers import NamedObservation
 
 # A hinge with a flexor and an extensor that pull at 0.02 and 0.03 m, and a slide tied to it that a
 # third muscle pulls with an arm of 1. Tendons are straight, so arms are the same in all postures.
@@ -87,7 +90,9 @@ def test_other_actuators_than_muscles_are_refused():
         '<muscle name="slider" tendon="slider" force="100" lengthrange="-3 3"/>',
         '<motor name="slider" tendon="slider"/>',
     )
-    with pytest.raises(ValueError, match="3 actuators with 2 activations"):
+    with pytest.raises(
+        ValueError, match="has 3 actuators, 2 of them muscles, and actions of 3 entries"
+    ):
         joint_torques(Body(motors))
     with pytest.raises(ValueError, match="MuJoCo"):
         joint_torques(make_env("overactuated"))
@@ -123,3 +128,25 @@ def test_excitations_are_what_the_simulator_is_driven_with(task):
     env.step(action)
     driven = torch.from_numpy(mujoco_state(env)[1].ctrl.copy()).float()
     assert torch.allclose(excitation(env, action["action"]), driven, atol=1e-6)
+
+
+@pytest.mark.parametrize(("low", "told", "sigmoid"), [(0.0, None, False), (-1.0, True, True)])
+def test_a_body_of_one_s_own_says_by_bounds_and_flag_how_actions_excite_it(
+    body, low, told, sigmoid
+):
+    body.action_space, body.normalize_act = gym.spaces.Box(low, 1.0, (3,)), told
+    assert sends_sigmoid(body, body.action_space.low, body.action_space.high) is sigmoid
+    parts = NamedObservation(body, activations=True, muscle_lengths=True).observation_space
+    assert parts["activation"].shape == parts["muscle_length"].shape == (3,)
+
+
+@pytest.mark.parametrize("told", [None, False])
+def test_a_body_that_does_not_say_how_its_actions_excite_it_is_one_sentence(body, told):
+    body.action_space, body.normalize_act = gym.spaces.Box(-1.0, 1.0, (3,)), told
+    env = GymWrapper(body)
+    for asked in (
+        lambda: excitation(env, torch.zeros(3)),
+        lambda: NamedObservation(body, activations=True),
+    ):
+        with pytest.raises(ValueError, match="Body takes actions below 0 and does not say how"):
+            asked()

@@ -75,9 +75,9 @@ def make_env(
             a seed of its own.
         device (torch.device, optional): where the tensors go; simulation stays on the CPU.
         activations (bool): adds ``activation``, the muscle activations in units of the
-            action (MyoSuite only). Defaults to ``False``.
+            action (bodies with muscles alone). Defaults to ``False``.
         muscle_lengths (bool): adds ``muscle_length``, the lengths of muscles with their tendons in
-            metres (MyoSuite only). Defaults to ``False``.
+            metres (the same). Defaults to ``False``.
         action_repeat (int): simulator steps for which every action is taken; their rewards add up,
             and an episode's time limit still counts simulator steps. Defaults to 1.
         success_key (str, optional): the entry of ``info`` that means success. Default: the

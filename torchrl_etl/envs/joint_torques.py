@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_etl.envs.simulator import mujoco_state, simulator
+from torchrl_etl.envs.muscles import muscle_state, sends_sigmoid
 
 __all__ = ["JointTorques", "active_torques", "excitation", "joint_torques"]
 
@@ -51,14 +51,9 @@ def joint_torques(
         >>> torques.matrix.shape  # 23 joints, 39 muscles
         (23, 39)
     """
-    model, now = mujoco_state(env)
+    model, now = muscle_state(env, "A torque on each joint per muscle, as of synergies=body,")
     import mujoco  # there, since its model is
 
-    if model.na != model.nu or (model.actuator_dyntype != mujoco.mjtDyn.mjDYN_MUSCLE).any():
-        raise ValueError(
-            f"{model.nu} actuators with {model.na} activations came, and not all are muscles; "
-            "joint torques per activation need a body that is moved by muscles alone."
-        )
     data, generator = mujoco.MjData(model), np.random.default_rng(seed)
     simple = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
     limited = np.flatnonzero(simple & model.jnt_limited.astype(bool))
@@ -78,9 +73,12 @@ def joint_torques(
 
 
 def excitation(env: EnvBase, action: Tensor) -> Tensor:
-    """The excitations in [0, 1] that MyoSuite makes of actions [*, n], its sigmoid or themselves.
+    """The excitations in [0, 1] of actions [*, n]: MyoSuite's sigmoid of them, or themselves.
 
     Held, an excitation is what the activation of a muscle comes to.
+
+    Raises:
+        ValueError: if the environment does not say which of the two.
 
     Examples:
         >>> import torch
@@ -88,8 +86,8 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
         >>> excitation(make_env("myoHandKeyTurn"), torch.tensor([-1.0, 0.5])).tolist()
         [0.0005..., 0.5]
     """
-    bounds = simulator(env).action_space
-    if (bounds.low == -1).all() and (bounds.high == 1).all():
+    bounds = env.full_action_spec_unbatched["action"].space
+    if sends_sigmoid(env, bounds.low, bounds.high):
         return (5.0 * (action - 0.5)).sigmoid()
     return action
 

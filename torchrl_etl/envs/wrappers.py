@@ -17,6 +17,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from torchrl_etl.envs.muscles import muscle_state, sends_sigmoid
+
 __all__ = [
     "SUCCESS_KEYS",
     "FiniteGuard",
@@ -159,9 +161,9 @@ class NamedObservation(gym.Wrapper):
         success_key (str, optional): the entry of ``info`` that becomes ``solved``, a boolean of
             shape [1] that is ``False`` at reset. ``None`` means that there is no such entry.
         activations (bool): whether to add ``activation``, the muscle activations in the units of
-            the action, shape [n] (MyoSuite tasks only).
+            the action, shape [n] (bodies with muscles alone).
         muscle_lengths (bool): whether to add ``muscle_length``, MuJoCo's ``actuator_length`` in the
-            order of the action, shape [n] (MyoSuite tasks only). That is the length of muscle and
+            order of the action, shape [n] (the same). That is the length of muscle and
             tendon together, in metres.
 
     Equation:
@@ -171,8 +173,8 @@ class NamedObservation(gym.Wrapper):
         :math:`a = x`.
 
     Raises:
-        ValueError: when ``activations`` or ``muscle_lengths`` is asked of an environment without
-            muscles.
+        ValueError: when ``activations`` or ``muscle_lengths`` is asked of an environment that does
+            not offer them, see :mod:`~torchrl_etl.envs.muscles`.
     """
 
     def __init__(
@@ -190,10 +192,11 @@ class NamedObservation(gym.Wrapper):
         if success_key is not None:
             entries["solved"] = spaces.Box(0, 1, (1,), np.bool_)
         if activations:
-            self._sigmoid = _sends_sigmoid(env)
+            muscle_state(env, "activations=True, as method=sar and fit.actions=activation have it,")
+            self._sigmoid = sends_sigmoid(env, env.action_space.low, env.action_space.high)
             entries["activation"] = env.action_space
         if muscle_lengths:
-            _check_muscles(env, "muscle_lengths")
+            muscle_state(env, "muscle_lengths=True, as method=dep has it,")
             shape = env.action_space.shape
             entries["muscle_length"] = spaces.Box(-np.inf, np.inf, shape, np.float32)
         self.observation_space = spaces.Dict(entries)
@@ -280,20 +283,3 @@ def _as_float32(space: spaces.Box) -> spaces.Box:
     with np.errstate(over="ignore"):
         low, high = space.low.astype(np.float32), space.high.astype(np.float32)
     return spaces.Box(low, high, dtype=np.float32)
-
-
-def _sends_sigmoid(env: gym.Env) -> bool:
-    """Whether the environment maps actions to muscle excitations through MyoSuite's sigmoid."""
-    _check_muscles(env, "activations")
-    simulation, bounds = env.unwrapped, env.action_space
-    return bool(simulation.normalize_act and np.all(bounds.low == -1) and np.all(bounds.high == 1))
-
-
-def _check_muscles(env: gym.Env, option: str) -> None:
-    simulation = env.unwrapped
-    model = getattr(simulation, "model", None)
-    if not hasattr(simulation, "normalize_act") or model is None or model.na != model.nu:
-        raise ValueError(
-            f"{option}=True needs a MyoSuite task all of whose actuators are muscles, "
-            f"got {simulation}; leave it out."
-        )

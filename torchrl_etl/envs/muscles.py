@@ -1,0 +1,58 @@
+"""What an environment must offer of its muscles, and how its actions excite them."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_etl.envs.simulator import mujoco_state, simulator
+
+__all__ = ["muscle_state", "sends_sigmoid"]
+
+
+def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
+    """MuJoCo's model and data of a body of which each entry of the action moves a muscle.
+
+    Raises:
+        ValueError: if it is another, with what asked for it.
+    """
+    inner, found = simulator(env), "none"
+    with suppress(ValueError):
+        model, data = mujoco_state(inner)
+        import mujoco  # there, since its model is
+
+        muscles = int((model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE).sum())
+        size = math.prod(inner.action_space.shape)
+        if muscles == model.nu == size:
+            return model, data
+        found = f"{model.nu} actuators, {muscles} of them muscles, and actions of {size} entries"
+    raise ValueError(
+        f"{asked_by} needs an environment with MuJoCo's model and data, each of whose actuators is "
+        f"a muscle and an entry of the action; {type(inner).__name__} has {found}."
+    )
+
+
+def sends_sigmoid(
+    env: EnvBase | gym.Env, low: Tensor | np.ndarray, high: Tensor | np.ndarray
+) -> bool:
+    """Whether actions in these bounds excite muscles by MyoSuite's sigmoid, or are excitations.
+
+    Raises:
+        ValueError: if neither is known to be so.
+    """
+    inner = simulator(env)
+    if (low >= 0).all():
+        return False
+    if getattr(inner, "normalize_act", False) and (low == -1).all() and (high == 1).all():
+        return True
+    raise ValueError(
+        f"{type(inner).__name__} takes actions below 0 and does not say how they excite its "
+        "muscles; let them be excitations, in [0, 1], or be in [-1, 1] with an attribute "
+        "normalize_act that is True, for MyoSuite's sigmoid."
+    )
