@@ -122,7 +122,7 @@ def test_a_run_takes_the_synergies_of_its_body_and_goes_on_with_them(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("env", "words"), [("overactuated", "MuJoCo"), ("humanoid-stand", "has 21 actuators, 0 of them")]
+    ("env", "words"), [("overactuated", "MuJoCo"), ("humanoid-stand", "21 actuators, 0 of them")]
 )
 def test_a_body_without_muscles_has_no_synergies_of_its_own(env, words, tmp_path, monkeypatch):
     made, make_env = [], Context.make_env

@@ -1,9 +1,10 @@
 """Numbers that are not finite stop a run, and the error says where they came from."""
 
+import numpy as np
 import pytest
 import torch
 
-from tests.planted_env import PLANTED
+from tests.planted_env import PLANTED, Planted
 from torchrl_etl.envs import SimulationError, make_env
 
 
@@ -21,6 +22,15 @@ def test_a_fault_stops_the_run_and_says_where(fault, says, num_envs):
     with pytest.raises(SimulationError) as caught:
         env.rollout(4, auto_reset=False, tensordict=env.reset(seed=9))
     assert says in str(caught.value) and PLANTED in str(caught.value)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_an_observation_of_another_size_than_its_space_is_one_sentence(num_envs, monkeypatch):
+    monkeypatch.setattr(Planted, "reset", lambda self, **_: (np.zeros(2), {}))
+    monkeypatch.setattr(Planted, "count", 0, raising=False)
+    words = r"observation has shape \(2,\) and not its space's \(3,\) at step 0 of episode 1"
+    with pytest.raises(SimulationError, match=words):
+        make_env(PLANTED, num_envs=num_envs).reset(seed=0)
 
 
 def test_a_divergence_that_dm_control_reports_is_a_simulation_error(tmp_path, monkeypatch):

@@ -35,7 +35,8 @@ SUCCESS_KEYS = ("solved", "is_success", "success")
 
 
 class SimulationError(RuntimeError):
-    """A simulation left the real numbers: an observation, a reward or an action is not finite."""
+    """A simulation left the real numbers: an observation, a reward or an action is not finite; or
+    its observation does not fit the space that it declares."""
 
 
 class FlatObservation(gym.ObservationWrapper):
@@ -111,6 +112,9 @@ class FiniteGuard(gym.Wrapper):
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)
         observation = np.asarray(observation, dtype=np.float32)
+        if observation.shape != (expected := self.observation_space.shape):
+            what = f"observation has shape {observation.shape} and not its space's {expected}"
+            raise self._error(what, "let observation_space be that of what reset and step return")
         self._check("observation", observation)
         return observation, info
 
