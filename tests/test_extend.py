@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
+from typing import ClassVar
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import LossModule
+from torchrl.record.loggers import Logger
 
 from tests.commands import command
 from tests.configs import CONF, ROOT, composed, tiny
@@ -76,6 +78,20 @@ class Embedding(Exploration):
 
     def embed(self, rows):
         return rows["next", "observation"], rows["observation"]
+
+
+class Remembering(Logger):
+    logged: ClassVar[dict] = {}
+
+    def __init__(self, exp_name, log_dir, prefix):
+        super().__init__(exp_name, log_dir)
+        self.prefix = prefix
+
+    def _create_experiment(self):
+        return self.logged
+
+    def log_scalar(self, name, value, step=None):
+        self.experiment[f"{self.prefix}{name}", step] = value
 
 
 class NoBundle(Learned):
@@ -145,6 +161,19 @@ def test_what_an_exploration_embeds_of_whole_transitions_is_told_or_why_not(
     found = Experiment(config, say=said.append).run()["synergies"]
     assert ("direction_alignment" in found) is not fails
     assert any("could not embed its transitions (KeyError('phase'))" in s for s in said) is fails
+
+
+def test_a_logger_of_one_s_own_gets_the_run_s_numbers_and_another_class_is_refused(tmp_path):
+    name = "tests.test_extend:Remembering"
+    asked = ("method=sac", "learn.frames=64", "evaluation.episodes=1", f"log=['{name}']")
+    config = tiny(f"run_dir='{tmp_path}/run'", *asked)
+    config.logger_kwargs = {"Remembering": {"prefix": "my/"}}
+    summary = Experiment(config).run()
+    returns = summary["learn"]["return"]
+    assert Remembering.logged["my/learn/eval/return", 64] == pytest.approx(returns["after"])
+    config.log = ["tests.test_extend:NoBundle"]
+    with pytest.raises(ValueError, match=r"^log is .*no class NoBundle that is derived from Logger"):
+        Experiment(config)
 
 
 def test_a_model_whose_decoder_no_bundle_holds_is_refused_before_stage_1(tmp_path):

@@ -9,11 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torchrl.record.loggers import Logger
 
-from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
+from torchrl_etl.checks import (
+    check_choice,
+    check_flag,
+    check_integer,
+    check_real,
+    check_sizes,
+    renaming,
+)
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.extras import extra
+from torchrl_etl.own_code import find_class
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -240,6 +249,10 @@ def _check_loggers(names: object) -> None:
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ValueError(f"log is {names!r}; it must be a list, such as [tensorboard].")
     for name in names:
+        if ":" in str(name):
+            with renaming(kind="log"):
+                find_class(name, {}, Logger)
+            continue
         check_choice("log", name, _LOGGERS)
         if name != "csv" and find_spec(name) is None:
             raise ValueError(f"log names {name}, which is not installed; pip install {name}.")

@@ -18,6 +18,7 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.extras import extra
 from torchrl_etl.io import as_json, read_json, write_atomically
+from torchrl_etl.own_code import find_class
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -161,8 +162,12 @@ class RunFolder:
     def _logger(self, name: str) -> Logger:
         if name == "tensorboard":
             return _ResumableTensorboard(str(self.path), self._purge_step)
+        module, _, key = name.rpartition(":")
+        given = self._config.get("logger_kwargs", {}).get(key, {})
+        if module:
+            return find_class(name, {}, Logger)(self.path.name, str(self.path), **given)
         options = {} if name == "csv" else self._own(name)
-        options |= self._config.get("logger_kwargs", {}).get(name, {})
+        options |= given
         title = name if name == "csv" else self.path.name
         return get_logger(name, str(self.path), title, **{f"{name}_kwargs": options})
 
