@@ -66,6 +66,10 @@ def main(config: DictConfig) -> None:
             raise ValueError(
                 f"{named}; pass run=PATH, the folder that etl_sac.py printed, or zoo=NAME."
             )
+        if config.env is not None and config.zoo is None:
+            raise ValueError(
+                "env is the task of an entry of the zoo; a run has its own, so leave it out."
+            )
         trained = of_a_run(config) if config.zoo is None else of_the_zoo(config)
         recorder = open_recorder(config, trained.env, size) if config.video else None
         task = resolve_task(trained.task["name"], trained.task["goal"])
@@ -118,6 +122,8 @@ def of_a_run(config: DictConfig) -> Trained:
 
 def of_the_zoo(config: DictConfig) -> Trained:
     check_device(config.device)
+    if config.env is not None:
+        zoo.trust(config.zoo, config.env)
     card = zoo.read_card(config.zoo)
     policy, env = zoo.load(config.zoo, device=config.device)
     before = partial(zoo.untrained, config.zoo, device=config.device)

@@ -58,10 +58,11 @@ def open_subject(config: DictConfig) -> Subject:
             f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
             "pass run=PATH, the folder that etl_sac.py printed, zoo=NAME, or bundle=PATH env=TASK."
         )
-    if named != ["bundle"] and (config.env is not None or config.goal is not None):
+    told = config.env if named == ["run"] else None  # an entry does not get to import its task
+    if named != ["bundle"] and (told is not None or config.goal is not None):
         raise ValueError(f"{named[0]} has a task of its own; leave env and goal out.")
     if named == ["zoo"]:
-        return open_zoo(config.zoo)
+        return open_zoo(config.zoo, config.env)
     if named == ["run"]:
         return open_run(Path(config.run), defaults=hydra.compose("config"))
     return open_bundle(bundle_path(config.bundle), config.env, goal=config.goal)

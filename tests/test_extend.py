@@ -172,7 +172,9 @@ def test_a_logger_of_one_s_own_gets_the_run_s_numbers_and_another_class_is_refus
     returns = summary["learn"]["return"]
     assert Remembering.logged["my/learn/eval/return", 64] == pytest.approx(returns["after"])
     config.log = ["tests.test_extend:NoBundle"]
-    with pytest.raises(ValueError, match=r"^log is .*no class NoBundle that is derived from Logger"):
+    with pytest.raises(
+        ValueError, match=r"^log is .*no class NoBundle that is derived from Logger"
+    ):
         Experiment(config)
 
 

@@ -6,7 +6,9 @@ import hashlib
 import json
 import shlex
 import shutil
+import sys
 
+import gymnasium
 import pytest
 import safetensors.torch
 import torch
@@ -300,6 +302,26 @@ def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
         zoo.load("hand")
 
 
+def test_an_entry_on_a_task_of_one_s_own_needs_its_name_from_a_person(
+    exported, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(exported, tmp_path / "toy")
+    task = json.loads((tmp_path / "toy" / "card.json").read_text())["task"]
+    rewrite(tmp_path / "toy", task={**task, "name": "own_toys:OwnToy-v0"})
+    made = "'OwnToy-v0', 'torchrl_etl.envs:AnalyticOveractuated', max_episode_steps=25"
+    (tmp_path / "own_toys.py").write_text(f"import gymnasium\ngymnasium.register({made})")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert command("evaluate.py", "zoo=toy", "episodes=1") != 0
+    assert "if you trust it, pass env=own_toys:OwnToy-v0" in capsys.readouterr().err
+    assert command("evaluate.py", "zoo=toy", "env=own_toys:OwnToy-v1", "episodes=1") != 0
+    assert "is 'own_toys:OwnToy-v0' and not 'own_toys:OwnToy-v1'" in capsys.readouterr().err
+    assert "own_toys" not in sys.modules
+    assert command("evaluate.py", "zoo=toy", "env=own_toys:OwnToy-v0", "episodes=1") == 0
+    assert open_zoo("toy", "own_toys:OwnToy-v0").drivers[0] == "policy"
+    sys.modules.pop("own_toys"), gymnasium.registry.pop("OwnToy-v0")
+
+
 @pytest.mark.parametrize(
     ("recipe", "arguments", "words"),
     [
@@ -309,6 +331,7 @@ def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
         ("export.py", ["run=explored", "part=policy"], "part is 'policy'; choose one of"),
         ("evaluate.py", ["zoo=overactuted"], "nearest: overactuated"),
         ("evaluate.py", ["zoo=a", "run=b"], "a run and an entry are named"),
+        ("evaluate.py", ["run=b", "env=a"], "env is the task of an entry of the zoo"),
         ("evaluate.py", ["zoo=overactuated", "device=gpu"], "device is 'gpu'; use cpu, cuda or"),
         ("etl_sac.py", ["synergies=zoo:nowhere", "env=overactuated"], "The zoo has no 'nowhere'"),
     ],

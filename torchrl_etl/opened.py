@@ -91,13 +91,14 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
     )
 
 
-def open_zoo(name: str) -> Subject:
+def open_zoo(name: str, env: str | None = None) -> Subject:
     """The policy of an entry of the zoo, and its synergies where it acts through some.
 
     An entry of synergies alone is shown on the task that they were explored on.
 
     Args:
         name (str): an entry, see :func:`torchrl_etl.zoo.find`.
+        env (str, optional): its task, where that is of a module of your own.
 
     Raises:
         ZooError: if there is no such entry, or its policy is damaged.
@@ -109,10 +110,12 @@ def open_zoo(name: str) -> Subject:
         'policy'
     """
     if zoo.synergies_alone(name):
-        return replace(open_bundle(zoo.synergies(name)), name=f"zoo={name}")
+        return replace(open_bundle(zoo.synergies(name), env), name=f"zoo={name}")
+    if env is not None:
+        zoo.trust(name, env)
     card = zoo.read_card(name)
-    policy, env = zoo.load(name)
-    env.close()
+    policy, simulator = zoo.load(name)
+    simulator.close()
     of_task = dict(card.task)
     task = resolve_task(of_task.pop("name"), of_task.pop("goal", None))
     return Subject(

@@ -17,6 +17,7 @@ from torchrl_etl.zoo.entry import (
     save_entry,
     synergies,
     synergies_alone,
+    trust,
     untrained,
 )
 from torchrl_etl.zoo.policy import describe_decoder, make_policy
@@ -35,5 +36,6 @@ __all__ = [
     "save_entry",
     "synergies",
     "synergies_alone",
+    "trust",
     "untrained",
 ]

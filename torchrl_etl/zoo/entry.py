@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import check_choice, not_finite
-from torchrl_etl.envs import EnvironmentSpec, make_env
+from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.io import own_folder, read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.own_code import check_imported
@@ -32,6 +32,7 @@ __all__ = [
     "save_entry",
     "synergies",
     "synergies_alone",
+    "trust",
     "untrained",
 ]
 
@@ -206,6 +207,17 @@ def synergies_alone(name: str | os.PathLike[str]) -> bool:
     return not (folder / CARD).exists() and _holds_bundle(folder)
 
 
+def trust(name: str | os.PathLike[str], env: str) -> None:
+    """Import the module of an entry's task, which a card does not get to do, for who names it.
+
+    Raises:
+        ZooError: if that is not its task.
+    """
+    if env != (task := read_card(name).task.get("name")):
+        raise ZooError(f"The task of {find(name)} is {task!r} and not {env!r}; leave env out.")
+    resolve_task(env)
+
+
 def save_entry(
     folder: str | os.PathLike[str],
     policy: TensorDictModuleBase,
@@ -279,8 +291,9 @@ def _fill(
 
 
 def _make_env(folder: Path, card: Card, device: torch.device | str | None) -> EnvBase:
-    source = f"The task of {folder}"
-    check_imported(card.task.get("name"), source, ZooError, "import it yourself first")
+    source, task = f"The task of {folder}", card.task.get("name")
+    remedy = f"if you trust it, pass env={task} to the recipe, or import it first in Python"
+    check_imported(task, source, ZooError, remedy)
     try:
         return make_env(**card.task, device=device)
     except (TypeError, ValueError) as error:
