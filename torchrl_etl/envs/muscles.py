@@ -15,6 +15,8 @@ from torchrl_etl.envs.simulator import mujoco_state, simulator
 
 __all__ = ["muscle_state", "sends_sigmoid"]
 
+Array = Tensor | np.ndarray
+
 
 def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
     """MuJoCo's model and data of a body of which each entry of the action moves a muscle.
@@ -38,9 +40,7 @@ def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
     )
 
 
-def sends_sigmoid(
-    env: EnvBase | gym.Env, low: Tensor | np.ndarray, high: Tensor | np.ndarray
-) -> bool:
+def sends_sigmoid(env: EnvBase | gym.Env, low: Array, high: Array) -> bool:
     """Whether actions in these bounds excite muscles by MyoSuite's sigmoid, or are excitations.
 
     Raises:
