@@ -24,6 +24,7 @@ from torchrl.envs.transforms import Transform
 
 from tests.frozen_by_a_graph import CHANGES, MAKERS
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
+from torchrl_etl.baselines.dynsyn import make_dynsyn_actor
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import HeldNoise, SynergyDecoder, make_actor
@@ -336,3 +337,15 @@ def test_an_environment_that_it_does_not_know_is_refused():
         VectorCollector(lambda: make().append_transform(StepCounter()), policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="num_envs=2 or more"):
         VectorCollector(lambda: make_env("overactuated"), policy, frames_per_batch=12)
+
+
+def test_a_reset_leaves_the_buffers_that_a_policy_writes_as_they_are():
+    env = make_env("overactuated", num_envs=2, seed=0)
+    spec = env.full_action_spec_unbatched["action"]
+    actor = make_dynsyn_actor({"observation": 6}, spec, [0, 1, 2, 3] * 4, hidden=(8,))
+    collector = VectorCollector(env, actor, frames_per_batch=8, total_frames=-1)
+    before = [buffer.clone() for buffer in actor.buffers()]
+    next(iter(collector))
+    collector.reset()
+    assert all(map(torch.equal, before, actor.buffers()))
+    collector.shutdown()

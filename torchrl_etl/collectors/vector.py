@@ -172,7 +172,7 @@ class VectorCollector(Collector):
         for key, values in rows.items():
             batch[key].copy_(torch.from_numpy(np.stack(values, axis=1)))
         for key, value in now.items():
-            carrier.set(key, torch.from_numpy(value))
+            carrier.set(key, torch.tensor(value))  # a copy: a policy may write its own buffers
         return batch
 
     def _step(self, now: Arrays) -> tuple[Arrays, Arrays]:
