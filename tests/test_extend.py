@@ -104,10 +104,11 @@ class NoBundle(Learned):
 @pytest.fixture
 def own(tmp_path, monkeypatch):
     """The page's files in a folder of their own, which is the current one."""
+    folder = tmp_path / "my folder"
     for name, content in FILES.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(content, encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [*sys.path])
     yield
     for module in MODULES:
@@ -207,9 +208,9 @@ def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(own):
     found.stage.close()
 
 
-def test_the_toy_synergies_fit_recordings_worse_than_nmf(own, tmp_path, capsys):
+def test_the_toy_synergies_fit_recordings_worse_than_nmf(own, capsys):
     code = compile(FILES["recordings.py"], "recordings.py", "exec")
-    sys.path.append(str(tmp_path))
+    sys.path.append("")
     exec(code, {"__name__": "__main__"})
     nmf, at_random = (float(line.split()[-1]) for line in capsys.readouterr().out.splitlines())
     assert nmf > 0.99 > at_random > 0

@@ -32,7 +32,7 @@ class _OwnFolder(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         if OWN.is_dir():
-            search_path.append("torchrl_etl", OWN.resolve().as_uri())
+            search_path.append("torchrl_etl", f"file://{OWN.resolve()}")  # spaces as they are
 
 
 Plugins.instance().register(_OwnFolder)
