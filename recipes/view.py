@@ -60,7 +60,8 @@ def open_subject(config: DictConfig) -> Subject:
         )
     told = config.env if named == ["run"] else None  # an entry does not get to import its task
     if named != ["bundle"] and (told is not None or config.goal is not None):
-        raise ValueError(f"{named[0]} has a task of its own; leave env and goal out.")
+        given = "env and goal" if named == ["run"] else "goal"
+        raise ValueError(f"{named[0]} has a task of its own; leave {given} out.")
     if named == ["zoo"]:
         return open_zoo(config.zoo, config.env)
     if named == ["run"]:

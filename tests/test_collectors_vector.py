@@ -339,11 +339,12 @@ def test_an_environment_that_it_does_not_know_is_refused():
         VectorCollector(lambda: make_env("overactuated"), policy, frames_per_batch=12)
 
 
-def test_a_reset_leaves_the_buffers_that_a_policy_writes_as_they_are():
+@pytest.mark.parametrize("kind", [VectorCollector, Collector])
+def test_a_reset_leaves_the_buffers_that_a_policy_writes_as_they_are(kind):
     env = make_env("overactuated", num_envs=2, seed=0)
     spec = env.full_action_spec_unbatched["action"]
     actor = make_dynsyn_actor({"observation": 6}, spec, [0, 1, 2, 3] * 4, hidden=(8,))
-    collector = VectorCollector(env, actor, frames_per_batch=8, total_frames=-1)
+    collector = kind(env, actor, frames_per_batch=8, total_frames=-1)
     before = [buffer.clone() for buffer in actor.buffers()]
     next(iter(collector))
     collector.reset()

@@ -134,7 +134,7 @@ def test_critics_of_another_size_than_the_support_are_one_sentence(
     bins: int, entries: int | None
 ) -> None:
     support = None if entries is None else torch.linspace(-5.0, 5.0, entries)
-    words = rf"have {bins} output\(s\) and the support {entries or 1} \(1 stands for none\)"
+    words = rf"write is {bins}, and the support has {entries or 1} \(1 stands for none\)"
     with pytest.raises(ValueError, match=words):
         make_loss(bins=bins, support=support)(TestLeanSACLoss().make_data())
 

@@ -81,6 +81,17 @@ def test_what_two_losses_ask_for_is_computed_once_and_what_changed_between_them_
     assert sum(node.target in kinds for node in graphs[0].nodes) == 2
 
 
+def test_two_draws_stay_two():
+    def drawn(x: torch.Tensor) -> list[torch.Tensor]:
+        return [torch.randn_like(x) + 1, torch.randn_like(x) + 1, x.clone().uniform_()]
+
+    outs = []
+    for function in (compiled(drawn), drawn):
+        torch.manual_seed(0)
+        outs.append(function(torch.zeros(8, 5)))
+    torch.testing.assert_close(*outs)
+
+
 @pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="a folder nobody can write to")
 def test_a_cache_that_cannot_be_written_is_named_with_the_variable_that_moves_it(monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/sys/kernel")

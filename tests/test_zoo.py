@@ -227,6 +227,17 @@ def test_given_synergies_are_those_of_the_entry(exported):
     assert str(exported) not in command_of(made, composed, CONF, "toy")
 
 
+def test_the_command_on_a_card_names_the_recipes_file_of_a_kind_whatever_stands_in_conf(
+    tmp_path, monkeypatch
+):
+    (own := tmp_path / "conf" / "synergies").mkdir(parents=True)
+    (own / "a_wide.yaml").write_text("kind: nmf")
+    (own / "broken.yaml").write_text("a: [")
+    monkeypatch.chdir(tmp_path)
+    made = composed(["env=overactuated", "synergies=nmf"])
+    assert "synergies=nmf" in command_of(made, composed, CONF, "toy")
+
+
 @pytest.mark.parametrize("choice", ["synergies=zoo:{}", "method=sac", "method=lattice"])
 def test_the_command_of_a_run_that_explored_nothing_makes_the_same_configuration(choice, exported):
     made = Experiment(tiny("run_dir=unused", choice.format(exported))).config

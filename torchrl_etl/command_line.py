@@ -91,7 +91,7 @@ def check_overrides(
         if key not in known and section not in OPEN_SECTIONS:
             near = difflib.get_close_matches(key, list(dict.fromkeys([*known, *short])), n=3)
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
-            of = f"with {section}={choices[section]} " if section in groups else ""
+            of = f"with {section}={choices[section]} " if choices.get(section) else ""
             sys.exit(f"Error: {of}there is no setting {key!r}; {hint}")
         with one_sentence(ValueError):
             check_prefix(parse_override(argument), key in known)

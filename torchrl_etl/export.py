@@ -149,8 +149,10 @@ def command_of(config: DictConfig, compose: Compose, groups: Path, name: str) ->
 
 def _says(file: Path, key: str) -> Any:
     """A setting in a file of a group, which writes it in full or as one of its own."""
-    content = OmegaConf.load(file)
-    return OmegaConf.select(content, key, default=content.get(key.rpartition(".")[2]))
+    with suppress(Exception):  # a file that nobody chose may hold anything
+        content = OmegaConf.load(file)
+        return OmegaConf.select(content, key, default=content.get(key.rpartition(".")[2]))
+    return None
 
 
 def _differences(base: dict, mine: dict, prefix: str = "") -> Iterator[tuple[str, str]]:

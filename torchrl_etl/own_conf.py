@@ -23,8 +23,11 @@ def group_files(groups: Path, group: str) -> dict[str, Path]:
         >>> sorted(group_files(Path("recipes/conf"), "learner"))
         ['plain']
     """
-    files = (file for conf in (OWN, groups) for file in sorted((conf / group).glob("*.yaml")))
-    return {file.stem: file for file in files}  # the recipes' go first, for Hydra as well
+    found: dict[str, Path] = {}
+    for conf in (groups, OWN):  # of two with one name Hydra, too, takes the recipes'
+        for file in sorted((conf / group).glob("*.yaml")):
+            found.setdefault(file.stem, file)
+    return found
 
 
 class _OwnFolder(SearchPathPlugin):

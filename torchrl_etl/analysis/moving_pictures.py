@@ -100,8 +100,8 @@ def _write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
 
 
 def animated_picture(frames: Iterable[np.ndarray], *, quality: int = 50) -> bytes:
-    """Each second of the frames [H, W, 3] of the first eight seconds, at most 640 pixels wide, as
-    an endless WebP, in a quality from 0, the smallest, to 100.
+    """Every other frame [H, W, 3], of 25 a second, of the first eight seconds, at most 640 pixels
+    wide, as an endless WebP, in a quality from 0, the smallest, to 100.
     """
     with extra("video"):
         from PIL import Image

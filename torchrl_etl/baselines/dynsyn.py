@@ -208,7 +208,9 @@ class DynSynNetwork(nn.Module):
         loc, scale = self.normal(shared)
         amplitude = self.amplitude.to(loc).unsqueeze(-1)
         fixed = (amplitude, self.group, self.first, self.slot)
-        return loc, scale, weight_loc, *(each.expand(*loc.shape[:-1], -1) for each in fixed)
+        # Copies: whoever clears what an actor wrote would clear its buffers.
+        shape = (*loc.shape[:-1], -1)
+        return loc, scale, weight_loc, *(each.expand(shape).clone() for each in fixed)
 
 
 def make_dynsyn_actor(

@@ -34,11 +34,11 @@ _KNOWN_DISTRIBUTIONS = (_OURS, "torch.distributions.", "torchrl.modules.distribu
 class PolicyOnArrays:
     """Calls a policy with arrays by key, and returns what it writes as arrays by key.
 
-    A policy whose modules are all of ``torch.nn``, TensorDict, TorchRL or this package, without
-    hooks, is traced into one graph: the same operations on the same weights without Python and
-    TensorDict in between, which the physics of each step drives out of the processor's caches. (On
-    batches as small as these ``torch.compile`` and AOTInductor are no faster, and take 10 to 35 s
-    to start.)
+    A policy of plain modules of ``torch.nn``, TensorDict, TorchRL and this package, without hooks
+    or log-probabilities, is traced into one graph: the same operations on the same weights without
+    Python and TensorDict in between, which the physics of each step drives out of the processor's
+    caches. (On batches as small as these ``torch.compile`` and AOTInductor are no faster, and take
+    10 to 35 s to start.)
 
     In a module of another's a graph would freeze branches, counts and whatever else is Python. A
     policy with such a one is called as it is, with a tensordict of all arrays, and everything that

@@ -57,9 +57,9 @@ class VectorCollector(Collector):
     Args:
         create_env_fn (EnvBase or callable): the environment, or what builds it.
         policy (TensorDictModule): what acts in it; random actions if there is none. A sequence of
-            modules of ``torch.nn``, TensorDict, TorchRL and this package is evaluated on bare
-            tensors, as one graph. One with modules of another's or with hooks, of which a graph
-            might miss something, is called with a tensordict, which is told in a warning.
+            plain modules of ``torch.nn``, TensorDict, TorchRL and this package is evaluated on bare
+            tensors, as one graph. Another, of which a graph might miss something, is called with a
+            tensordict, which is told in a warning unless all of it is this package's.
         **kwargs: see :class:`torchrl.collectors.Collector`. The policy is trusted, and the batch
             is one preallocated tensordict.
 
@@ -112,7 +112,7 @@ class VectorCollector(Collector):
             warnings.warn(
                 f"The policy is called with a tensordict at each step, which takes longer than a "
                 f"traced graph, since a graph may miss what {', '.join(foreign)} does (hooks, "
-                "branches, counts); it can be traced if built of torch.nn and torchrl_etl.",
+                "branches, counts, log-probabilities).",
                 stacklevel=3,
             )
 

@@ -86,7 +86,8 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
         >>> excitation(make_env("myoHandKeyTurn"), torch.tensor([-1.0, 0.5])).tolist()
         [0.0005..., 0.5]
     """
-    bounds = env.full_action_spec_unbatched["action"].space
+    base = getattr(env, "base_env", env)  # under a SynergyAction actions are synergies
+    bounds = base.full_action_spec_unbatched["action"].space
     if sends_sigmoid(env, bounds.low, bounds.high):
         return (5.0 * (action - 0.5)).sigmoid()
     return action

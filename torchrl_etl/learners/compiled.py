@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import wraps
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from tensordict.nn import CudaGraphModule
 from tensordict.nn.functional_modules import _exclude_td_from_pytree
 from torch import Tensor, _inductor
-from torch._functorch.compile_utils import fx_graph_cse
+from torch._functorch import compile_utils
 from torch._guards import TracingContext, tracing
 from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._subclasses import FakeTensorMode
@@ -119,11 +120,18 @@ def _graph(
 class _ComputeOnce(CustomGraphPass):
     """Equal operations of a graph become one: two losses ask the same critic for the same states.
 
-    Inductor (torch 2.13) merges them in graphs that autograd splits in two, and in no others.
+    Inductor (torch 2.13) merges them in graphs that autograd splits in two, and in no others. Two
+    draws are never equal, though PyTorch's own list of operations that draw lacks ``randn_like``.
     """
 
     def __call__(self, graph: Graph) -> None:
-        graph.owning_module.graph = fx_graph_cse(graph)
+        draws = [
+            compile_utils.get_aten_target(node)
+            for node in graph.nodes
+            if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ())
+        ]
+        with patch.object(compile_utils, "rand_ops", [*compile_utils.rand_ops, *draws]):
+            graph.owning_module.graph = compile_utils.fx_graph_cse(graph)
 
     def uuid(self) -> bytes:
         return get_hash_for_files((__file__,))

@@ -248,7 +248,9 @@ class GMVAE(nn.Module):
 
         The mean over components can fall between two modes, where no action lives.
         """
-        posterior = self.encode(as_actions(action, low=self.low, high=self.high))
+        if not isinstance(action, Tensor):
+            action = as_actions(action, low=self.low, high=self.high)
+        posterior = self.encode(action.to(self.low))
         best = posterior.logits.argmax(-1)[..., None, None]
         return posterior.loc.take_along_dim(best, -2).squeeze(-2)
 

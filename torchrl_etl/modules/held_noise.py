@@ -61,6 +61,7 @@ class HeldNoise(TensorDictModuleBase):
         init_key: NestedKey = "is_init",
     ) -> None:
         kind = actor[-1].distribution_class
+        kind = getattr(kind, "func", kind)  # of a partial
         if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
             raise ValueError(
                 f"The actor draws from {getattr(kind, '__name__', kind)}; noise is held in a "

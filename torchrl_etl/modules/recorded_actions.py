@@ -114,7 +114,7 @@ def as_bounds(low: Any, high: Any, action_dim: int) -> tuple[Tensor, Tensor]:
 
 
 def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """Both bounds of a ``Bounded`` leaf; those of an ``Unbounded`` one are the largest numbers.
+    """Both bounds of a ``Bounded`` leaf; an ``Unbounded`` one has the largest numbers as such.
 
     Raises:
         ValueError: if the spec is another, or its range is not finite.

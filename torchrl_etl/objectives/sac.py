@@ -17,6 +17,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import ValueEstimators, distance_loss
+from torchrl.objectives.value import TD0Estimator
 
 from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.draws import standard_normal
@@ -148,7 +149,8 @@ class LeanSACLoss(SACLoss):
         Raises:
             ValueError: for another estimator than TD0 with a ``support``.
         """
-        if self.support is not None and value_type not in (None, ValueEstimators.TD0):
+        one_step = value_type in (None, ValueEstimators.TD0, TD0Estimator)
+        if self.support is not None and not (one_step or isinstance(value_type, TD0Estimator)):
             raise ValueError(
                 f"value_type is {value_type}, but with a support targets are distributions, which "
                 "go back one step; take ValueEstimators.TD0, or leave the support out."
@@ -188,8 +190,9 @@ class LeanSACLoss(SACLoss):
         bins = 1 if self.support is None else len(self.support)
         if outputs.shape[-1] != bins:
             raise ValueError(
-                f"The critics have {outputs.shape[-1]} output(s) and the support {bins} (1 stands "
-                "for none); give both as many: make_critic(bins=...), support=torch.linspace(...)."
+                f"The last size of what critics write is {outputs.shape[-1]}, and the support has "
+                f"{bins} (1 stands for none); give both as many: make_critic(bins=...), "
+                "support=torch.linspace(...)."
             )
         if self.support is None:
             return outputs.squeeze(-1)

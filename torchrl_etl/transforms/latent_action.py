@@ -46,7 +46,7 @@ class LatentAction(ModuleTransform):
     ``("next", "executed_action")``, and before n-step returns
     ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)`` brings it to
     the root. A replay buffer that several collectors share, or that a rollout is first put into,
-    has no root ``action`` either: append the same transform to it.
+    has no root ``action`` either: without n-step returns, append the same transform to it.
 
     The module is held by reference: changing its weights in place changes the next step. It is a
     submodule, so ``state_dict()`` holds it and attaching moves it to the env's device and to eval

@@ -214,7 +214,7 @@ def trust(name: str | os.PathLike[str], env: str) -> None:
         ZooError: if that is not its task.
     """
     if env != (task := read_card(name).task.get("name")):
-        raise ZooError(f"The task of {find(name)} is {task!r} and not {env!r}; leave env out.")
+        raise ZooError(f"The task of {find(name)} is {task!r} and not {env!r}; pass that.")
     resolve_task(env)
 
 
