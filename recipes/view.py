@@ -58,10 +58,10 @@ def open_subject(config: DictConfig) -> Subject:
             f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
             "pass run=PATH, the folder that etl_sac.py printed, zoo=NAME, or bundle=PATH env=TASK."
         )
-    told = config.env if named == ["run"] else None  # an entry does not get to import its task
-    if named != ["bundle"] and (told is not None or config.goal is not None):
-        given = "env and goal" if named == ["run"] else "goal"
-        raise ValueError(f"{named[0]} has a task of its own; leave {given} out.")
+    # env= of an entry says where its task is imported from: an entry does not get to say it.
+    own = {"run": ["env", "goal"], "zoo": ["goal"], "bundle": []}[named[0]]
+    if given := [setting for setting in own if config[setting] is not None]:
+        raise ValueError(f"{named[0]} has a task of its own; leave {' and '.join(given)} out.")
     if named == ["zoo"]:
         return open_zoo(config.zoo, config.env)
     if named == ["run"]:

@@ -200,8 +200,8 @@ def recipe():
     [
         ({}, "nothing to look at was named; pass run=PATH"),
         ({"run": "a", "bundle": "b"}, "run and bundle were named"),
-        ({"run": "a", "env": "dog-run"}, "leave env and goal out"),
-        ({"zoo": "a", "goal": "random"}, "leave env and goal out"),
+        ({"run": "a", "env": "dog-run"}, "run has a task of its own; leave env out"),
+        ({"zoo": "a", "goal": "random"}, "zoo has a task of its own; leave goal out"),
         ({"bundle": "nowhere"}, "no synergy bundle at 'nowhere'"),
     ],
 )
