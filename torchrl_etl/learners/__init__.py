@@ -1,4 +1,4 @@
-"""What learns: networks, losses, targets and optimizer behind one update."""
+"""Learners: networks, losses, targets and optimizer behind one update."""
 
 from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.ema import WarmedUpEMA

@@ -1,4 +1,4 @@
-"""Adam that is handed its gradients."""
+"""Adam that takes gradients as an argument."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["GradientAdam"]
 
 
 class GradientAdam(Adam):
-    """:class:`torch.optim.Adam` whose step takes gradients, all parameters in one operation.
+    """:class:`torch.optim.Adam` that takes gradients as an argument, with one fused step.
 
-    Adam walks its parameters in Python at every step. Between products that fill a processor's
-    caches this takes twice as long as the step itself; here they are walked once for every choice
-    of parameters that have a gradient.
+    Adam loops over its parameters in Python at every step, which with cold caches takes twice as
+    long as the step itself. Here the loop runs once for each set of parameters with a gradient, and
+    its result is reused.
 
     Examples:
         >>> import torch
@@ -41,39 +41,39 @@ class GradientAdam(Adam):
 
     @property
     def rates(self) -> list[float]:
-        """The learning rates that :meth:`scale_rates` set, without asking a GPU."""
+        """Learning rates in effect, known without a GPU synchronization."""
         return [self.factor * group["initial_lr"] for group in self.param_groups]
 
     def scale_rates(self, factor: float) -> None:
-        """Set all learning rates to a share of those that they began with."""
+        """Set all learning rates to ``factor`` times their initial values."""
         self.factor = factor
         for group, rate in zip(self.param_groups, self.rates, strict=True):
             _set_rate(group, rate)
 
     @property
     def moments(self) -> list[Tensor]:
-        """Both moments of each parameter, in their order."""
+        """First and second moment of each parameter, in the order of the parameters."""
         return [state[key] for state in self._states for key in ("exp_avg", "exp_avg_sq")]
 
     @property
     def steps(self) -> list[Tensor]:
-        """The number of steps that each parameter has had."""
+        """Step count of each parameter."""
         return [state["step"] for state in self._states]
 
     def steps_of(self, parameters: Iterable[Tensor]) -> int:
-        """The most steps that one of these parameters has had."""
+        """Largest step count among these parameters."""
         steps = [self.state[each]["step"] for each in parameters if each in self.state]
         return int(torch.stack(steps).max()) if steps else 0
 
     def over(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
-        """The same for other parameters than these, before its first step."""
+        """A fresh optimizer with the same settings for ``other(parameter)`` of each parameter."""
         groups = [
             {**each, "params": list(map(other, each["params"]))} for each in self.param_groups
         ]
         return GradientAdam(groups)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take the state of another one, perhaps of another device; what rates began with stays."""
+        """Load a state dict, also from another device; keeps this one's initial learning rates."""
         kept = ("lr", "initial_lr", "capturable")
         own = [{key: group[key] for key in kept} for group in self.param_groups]
         super().load_state_dict(state_dict)
@@ -89,7 +89,7 @@ class GradientAdam(Adam):
 
     @torch.no_grad()
     def step_along(self, gradients: Sequence[Tensor | None]) -> None:
-        """One step along gradients in the order of the parameters; ``None`` leaves its own."""
+        """Take a step along gradients in the order of the parameters; ``None`` skips one."""
         absent = tuple(gradient is None for gradient in gradients)
         if absent not in self._walked:
             self._walked[absent] = self._walk(absent)
@@ -118,7 +118,7 @@ class GradientAdam(Adam):
         return [self.state[parameter] for parameter in self._parameters]
 
     def _begin(self) -> None:
-        """As Adam begins where a parameter has its first gradient."""
+        """Create the state that Adam creates at the first gradient of a parameter."""
         self._walked: dict[tuple[bool, ...], list[tuple[dict[str, Any], list[int], Any]]] = {}
         for parameter in self._parameters:
             if parameter not in self.state:
@@ -127,7 +127,7 @@ class GradientAdam(Adam):
                 self.state[parameter] = {"step": step, **moments}
 
     def _walk(self, absent: Sequence[bool]) -> list[tuple[dict[str, Any], list[int], Any]]:
-        """Each group, which gradients are its own, and what a step of their parameters changes."""
+        """Each group with the indices of its gradients, its parameters and their states."""
         parameters, index, walked = self._parameters, 0, []
         for group in self.param_groups:
             at = [i for i, _ in enumerate(group["params"], index) if not absent[i]]
@@ -141,13 +141,13 @@ class GradientAdam(Adam):
 
 
 def _set_rate(group: dict[str, Any], rate: float) -> None:
-    """Set a learning rate; a CUDA graph reads it from a tensor, and from that same tensor."""
+    """Set a learning rate, in place if it is a tensor, which a CUDA graph may read."""
     group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
 
 
 def _laid_out(tensor: Tensor, parameter: Tensor) -> Tensor:
-    """A gradient or a moment, in memory as its parameter is: fused Adam (torch 2.13) takes no
-    notice of strides on a CPU, and refuses others on a GPU."""
+    """Copy a gradient or moment to the strides of its parameter if they differ: fused Adam (torch
+    2.13) ignores strides on a CPU, and rejects differing ones on a GPU."""
     if tensor.stride() == parameter.stride():
         return tensor
     return torch.empty_like(parameter).copy_(tensor)

@@ -1,4 +1,4 @@
-"""A learner out of the sections of a configuration."""
+"""Build a learner from the sections of a configuration."""
 
 from __future__ import annotations
 
@@ -49,35 +49,35 @@ def build_learner(
     entropy: Callable[[Bounded, float | None], float] = entropy_target,
     more: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
 ) -> SACLearner:
-    """Build the networks for an environment's sizes and a learner that owns them.
+    """Build networks for an environment and the learner that owns them.
 
     Args:
         observation_dim (int): size of an observation.
-        action_spec (Bounded): bounds of the environment's action, unbatched, on the device that
-            everything shall live on.
+        action_spec (Bounded): the environment's action spec, unbatched; its device is the
+            learner's.
 
     Keyword Args:
         actor, critic (mapping): keyword arguments of ``make_actor`` and
             :func:`~torchrl_etl.modules.make_critic`.
         sac (mapping): keyword arguments of :class:`~torchrl_etl.learners.SACLearner`, and
             ``action_std`` (see :func:`~torchrl_etl.learners.entropy_target`) and
-            ``normalize_observations`` (actor and critics see what
-            :class:`~torchrl_etl.modules.RunningNorm` makes of observations).
-        noise (mapping): of exploration: ``kind``, ``"independent"`` at every step or ``"held"``
+            ``normalize_observations`` (actor and critics read observations normalized by
+            :class:`~torchrl_etl.modules.RunningNorm`).
+        noise (mapping): ``kind`` of exploration noise, ``"independent"`` at each step or ``"held"``
             for several, and keyword arguments of :class:`~torchrl_etl.modules.HeldNoise`.
-        init_random_actions (int): actions of each worker that are uniform within the bounds of
-            what the actor emits, before the policy's. Default: 0.
-        decoder (SynergyMap, optional): the actor emits what it reads. Default: an action.
-        inputs (mapping, optional): sizes of what the networks read beside the observation, by key.
+        init_random_actions (int): number of first actions of each worker that are drawn uniformly
+            from the bounds of the actor's output. Default: 0.
+        decoder (SynergyMap, optional): maps actor outputs to actions. Default: they are actions.
+        inputs (mapping, optional): sizes of network inputs besides the observation, by key.
         make_actor (callable): builds the actor. Default: :func:`~torchrl_etl.modules.make_actor`.
-        make_behavior (callable, optional): makes the policy that collects of the actor; ``noise``
-            is then not read.
-        wrap (callable): puts something around the policy that collects, its noise included.
-        entropy (callable): target entropy of the bounds and ``action_std``.
-        more (callable): further arguments of the learner, made for the actor.
+        make_behavior (callable, optional): builds the behavior policy from the actor; ``noise`` is
+            then ignored.
+        wrap (callable): wraps the behavior policy, noise included.
+        entropy (callable): maps the spec of actor outputs and ``action_std`` to a target entropy.
+        more (callable): maps the actor to additional arguments of the learner.
 
     Raises:
-        ValueError: naming the argument that cannot be used.
+        ValueError: if an argument is invalid; the message names it.
     """
     sac, device = dict(sac), action_spec.device
     with naming("sac"):
@@ -114,7 +114,7 @@ def build_learner(
 
 
 def with_noise(actor: Actor, *, kind: Noise, **options: Any) -> TensorDictModuleBase:
-    """The actor as it explores: its noise is drawn anew at every step, or held for several."""
+    """The actor with exploration noise, drawn at every step or held for several."""
     with naming("noise"):
         check_choice("kind", kind, get_args(Noise))
         return HeldNoise(actor, **options) if kind == "held" else actor

@@ -1,4 +1,4 @@
-"""An update as one compiled graph, or as it is where nothing can be compiled."""
+"""Compile an update into one graph, with a fallback to eager execution."""
 
 from __future__ import annotations
 
@@ -34,19 +34,18 @@ _ELSE = "compile=false leaves out the attempt"
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Trace a function of tensors or tensordicts into one graph at its first call, and compile it.
 
-    With :func:`torch.autograd.grad` inside the graph nothing has to be kept between a forward and
-    a backward half: on CPUs without AVX-512 the masks of rectifiers, kept as booleans, would cost
-    as much as a third of the products.
+    With :func:`torch.autograd.grad` inside the graph, nothing is saved between separate forward and
+    backward graphs. On CPUs without AVX-512, saving ReLU masks as booleans would cost as much as a
+    third of the matrix products.
 
-    It is traced by running it (:func:`~torch.fx.experimental.proxy_tensor.make_fx`), so that what
-    TensorDict does in Python costs no more than once, and is compiled anew for inputs of other
-    sizes. Whatever else it reads must stay the same tensors, whose values may change, and no branch
-    may depend on values. It draws from PyTorch's generator as it would uncompiled, so the numbers
-    are the same.
+    Tracing runs the function (:func:`~torch.fx.experimental.proxy_tensor.make_fx`), so TensorDict's
+    Python overhead is paid once. Inputs of other shapes trigger a recompilation. Any other tensors
+    that the function reads must keep their identity, though their values may change, and no branch
+    may depend on values. Random numbers come from PyTorch's generator and match eager execution.
 
-    Whatever stops a compilation (no compiler, a cache that cannot be written, an operation that
-    the compiler does not know) costs a warning that says why; the function then runs uncompiled,
-    this call included. It must change nothing but what it returns.
+    If compilation fails (no compiler, a read-only cache, an unsupported operation), a warning gives
+    the reason and the function runs uncompiled from this call on. The function must therefore have
+    no side effects.
 
     Examples:
         >>> import torch
@@ -86,7 +85,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 def _graph(
     function: Callable[..., Any], spec: TreeSpec, inputs: list[Tensor]
 ) -> Callable[[list[Tensor]], Any]:
-    """The function of arguments like these, given their tensors, as one compiled graph."""
+    """Compile the function for inputs like these; returns a function of their flat tensors."""
     returned: TreeSpec | None = None
 
     def flat(*leaves: Tensor) -> list[Any]:
@@ -94,17 +93,17 @@ def _graph(
         out, returned = tree_flatten(function(*tree_unflatten(list(leaves), spec)))
         return out
 
-    # No size is a symbol, but inductor (torch 2.13) caches nothing where none could be.
+    # All sizes are static, but inductor (torch 2.13) caches nothing without a shape environment.
     fake = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
     stand_ins = [fake.from_tensor(each, static_shapes=True) for each in inputs]
-    with torch.random.fork_rng():  # a compiler draws numbers of its own
-        # As under torch.compile, nothing looks at values to check them.
+    with torch.random.fork_rng():  # compilation draws random numbers
+        # As under torch.compile, skip checks that look at values.
         with torch.compiler._compile_session_context():
             trace = make_fx(
                 flat, decomposition_table=faster_products(), _allow_non_fake_inputs=True
             )
             traced = trace(*stand_ins)
-        # Calls between kernels in C++ rather than Python: 3 to 5 % of an update.
+        # Launch kernels from C++ rather than Python: this saves 3 to 5 % of an update.
         options = _options() | {"cpp_wrapper": all(each.device.type == "cpu" for each in inputs)}
         options["post_grad_custom_pre_pass"] = _ComputeOnce()
         with torch.no_grad(), tracing(TracingContext(fake)), _inductor.config.patch(options):
@@ -118,10 +117,10 @@ def _graph(
 
 
 class _ComputeOnce(CustomGraphPass):
-    """Equal operations of a graph become one: two losses ask the same critic for the same states.
+    """Common subexpression elimination: two losses evaluate the same critic on the same states.
 
-    Inductor (torch 2.13) merges them in graphs that autograd splits in two, and in no others. Two
-    draws are never equal, though PyTorch's own list of operations that draw lacks ``randn_like``.
+    Inductor (torch 2.13) applies it only to graphs that autograd splits in two. Random operations
+    are never merged; PyTorch's own list of them lacks ``randn_like``.
     """
 
     def __call__(self, graph: Graph) -> None:
@@ -138,17 +137,17 @@ class _ComputeOnce(CustomGraphPass):
 
 
 def cuda_graph(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Record what a function of a tensordict does on the GPU and play it back, as one launch."""
-    # It takes TensorDicts out of PyTree for good (tensordict 0.14.3), unless they are not in it.
+    """Capture a function of a tensordict as a CUDA graph and replay it in one launch."""
+    # tensordict 0.14.3 would otherwise unregister TensorDict from PyTree permanently.
     with _exclude_td_from_pytree():
         return CudaGraphModule(function, in_keys=[], out_keys=[], warmup=5)
 
 
 def _options() -> dict[str, Any]:
-    """What makes inductor (torch 2.13) draw as PyTorch does, and compile where a path has a space.
+    """Inductor options for eager random numbers, and for paths that contain spaces.
 
-    It hands the folder of PyTorch's libraries, its cache and its precompiled headers to a shell
-    without quotes.
+    Inductor (torch 2.13) passes the folders of PyTorch's libraries, its cache and its precompiled
+    headers to a shell without quotes.
     """
     from torch._inductor.runtime.cache_dir_utils import cache_dir, default_cache_dir
     from torch.utils.cpp_extension import TORCH_LIB_PATH
@@ -156,13 +155,13 @@ def _options() -> dict[str, Any]:
     options: dict[str, Any] = {"fallback_random": True}
     if _is_split(cache_dir()):
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"/tmp/torchinductor_{os.getuid()}"
-    if _is_split(default_cache_dir()):  # where its headers are, whatever the cache is
+    if _is_split(default_cache_dir()):  # holds the precompiled headers, wherever the cache is
         options["cpp_cache_precompile_headers"] = False
     if _is_split(TORCH_LIB_PATH):
-        # A kernel takes its symbols from the process instead, where PyTorch shows it them.
+        # Kernels then resolve symbols from the process, where the load below makes them global.
         options["aot_inductor.link_libtorch"] = False
         library = os.path.join(TORCH_LIB_PATH, "libtorch_cpu.so")
-        with suppress(OSError):  # elsewhere than on Linux it has another name
+        with suppress(OSError):  # it has another name outside Linux
             ctypes.CDLL(library, mode=os.RTLD_GLOBAL | os.RTLD_NOLOAD)
     return options
 
@@ -172,7 +171,7 @@ def _is_split(path: str) -> bool:
 
 
 def _reason(error: BaseException) -> str:
-    """Why a compilation failed and what helps, in half a sentence."""
+    """Why a compilation failed and how to fix it, as a clause for the warning."""
     from torch._inductor.exc import CppCompileError, InvalidCxxCompiler, TritonMissing
 
     for cause in _causes(error):
@@ -200,7 +199,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception and those that it came from, the innermost first."""
+    """An exception and its causes, innermost first."""
     if error is not None:
         yield from _causes(getattr(error, "inner_exception", None) or error.__cause__)
         yield error

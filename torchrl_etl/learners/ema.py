@@ -1,4 +1,4 @@
-"""An exponential moving average of weights that does not remember how they began."""
+"""An exponential moving average of weights with a warm-up."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ class WarmedUpEMA(AveragedModel):
     """A copy of a model whose weights are an EMA of the model's, with a warm-up.
 
     After ``n`` updates the decay is :math:`\\min(decay, (1 + n) / (10 + n))`, as in TensorFlow's
-    ``ExponentialMovingAverage``, so that a short run does not show its untrained weights. Buffers
-    are copied.
+    ``ExponentialMovingAverage``, so that initial weights soon lose their influence. Buffers are
+    copied.
 
-    PyTorch's own ``update_parameters``, given the same average as ``multi_avg_fn``, comes to the
-    same numbers in several times the time, as it looks up and sorts all tensors at each call.
+    PyTorch's ``update_parameters`` with an equivalent ``multi_avg_fn`` gives the same numbers but
+    takes several times as long, because it collects and sorts all tensors at each call.
 
     Args:
-        model (nn.Module): must keep its tensors, which are looked up once.
+        model (nn.Module): must keep its tensors, which are collected once.
         decay (float): in [0, 1); 0 copies the weights.
 
     Examples:
@@ -46,7 +46,7 @@ class WarmedUpEMA(AveragedModel):
 
     @torch.no_grad()
     def follow(self) -> None:
-        """Take the weights of now into the average."""
+        """Update the average with the current weights."""
         n = int(self.n_averaged)
         decay = min(self.decay, (1 + n) / (10 + n)) if n else 0.0
         if self._parameters_of[0]:
@@ -57,13 +57,13 @@ class WarmedUpEMA(AveragedModel):
 
     @property
     def tensors(self) -> list[Tensor]:
-        """What :meth:`follow` reads and changes, without the number of updates."""
+        """Every tensor that :meth:`follow` reads or modifies, except the update counter."""
         both = *self._parameters_of, *self._buffers_of
         return [tensor for each in both for tensor in each]
 
     def over(self, other: Callable[[Tensor], Tensor]) -> WarmedUpEMA:
-        """The same for other tensors than these; they share their number of updates."""
-        twin = copy(self)  # with the very same buffer ``n_averaged``
+        """A copy for ``other(tensor)`` of each tensor; the two share one update counter."""
+        twin = copy(self)  # shares the buffer ``n_averaged``
         twin._parameters_of = tuple(list(map(other, each)) for each in self._parameters_of)
         twin._buffers_of = tuple(list(map(other, each)) for each in self._buffers_of)
         return twin

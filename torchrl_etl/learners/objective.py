@@ -1,4 +1,4 @@
-"""What a learner minimizes on a batch: SAC's losses and the terms beside them."""
+"""The objective that a learner minimizes on a batch: SAC's losses and additional terms."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from torchrl_etl.objectives import LeanSACLoss
 __all__ = ["NORMALIZED", "Objective"]
 
 NORMALIZED = "normalized_observation"
-"""What actor and critics read where observations are normalized."""
+"""Key that actor and critics read if observations are normalized."""
 
 
 class Objective(nn.Module):
-    """A function of parameters and a batch; calling it changes nothing but :attr:`statistics`.
+    """A function of parameters and a batch; calling it modifies only :attr:`statistics`.
 
     Args:
         sac (LeanSACLoss, optional): the losses of actor, critics and temperature.
-        actor (TensorDictModuleBase): that actor, for terms that ask it for actions.
-        terms (sequence of Term): what is minimized beside them.
+        actor (TensorDictModuleBase): the actor, for terms that query it for actions.
+        terms (sequence of Term): losses to add to SAC's.
 
     Keyword Args:
-        normalizer (RunningNorm, optional): scales the observations that actor and critics read.
-        return_scale (ReturnScale, optional): scales the reward that SAC learns on.
+        normalizer (RunningNorm, optional): normalizes the observations for actor and critics.
+        return_scale (ReturnScale, optional): scales the reward that SAC learns from.
         reward (NestedKey): that reward, below ``"next"``. Default: ``"reward"``.
-        transforms (sequence of Transform): what each batch goes through first, without gradients
-            and with all networks as they are by then; those that they read and do not hold are
-            their ``networks``, whose buffers they may change if a term holds them, too.
+        transforms (sequence of Transform): applied to each batch first, without gradients and with
+            the current networks. The attribute ``networks`` of a transform lists networks that it
+            reads but does not own; it may modify their buffers if a term holds them.
     """
 
     def __init__(
@@ -53,13 +53,13 @@ class Objective(nn.Module):
         self.sac, self.actor, self.terms = sac, actor, nn.ModuleList(terms)
         self.normalizer, self.return_scale, self.reward = normalizer, return_scale, reward
         self.transforms = nn.ModuleList(transforms)
-        # In a tuple they are no part of it: whoever trains them saves them.
+        # A tuple, so they are no submodules: their owners train and save them.
         self.networks = tuple(own for each in transforms for own in getattr(each, "networks", ()))
         if sac is not None:
             sac.set_keys(reward=reward)
 
     def forward(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """The sum of all losses, and scalars to log; the batch [B] is left as it is."""
+        """The sum of all losses, and scalars to log; leaves the batch [B] unchanged."""
         batch = self.prepare(batch)
         loss, scalars = 0.0, TensorDict()
         if self.sac is not None:
@@ -69,28 +69,28 @@ class Objective(nn.Module):
             extra, logged = term(batch)
             loss = loss + extra
             scalars.update(logged)
-        if self.reward != "reward":  # a bonus: worth a look beside the task's reward
+        if self.reward != "reward":  # an intrinsic bonus, logged besides the task's reward
             scalars[self.reward] = batch["next", self.reward].mean()
         return loss, scalars
 
     def only(self, *terms: Term) -> Objective:
-        """These terms alone, on the same observations."""
+        """An objective of these terms only, with the same normalizer."""
         return Objective(None, self.actor, terms, normalizer=self.normalizer)
 
     @property
     def statistics(self) -> dict[str, Tensor]:
-        """What transforms may change, by their names in this module: buffers, as running means."""
+        """Buffers that transforms may modify, such as running means, by name in this module."""
         changing = {id(own) for own in nn.ModuleList([*self.transforms, *self.networks]).buffers()}
         return {
             name: own
             for prefix, module in self.named_modules()
-            if not isinstance(module, TensorDictParams)  # targets of a loss, which follow
+            if not isinstance(module, TensorDictParams)  # target parameters of a loss
             for name, own in module.named_buffers(prefix, recurse=False)
             if id(own) in changing
         }
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """The batch as transforms make it, observations and reward in units of those so far."""
+        """A transformed copy of the batch, with normalized observations and scaled reward."""
         batch = batch.copy()
         with torch.no_grad():
             for transform in self.transforms:

@@ -1,4 +1,4 @@
-"""What a SAC learner is made of: losses, units of the reward, parameters and their optimizer."""
+"""Parts of a SAC learner: losses, reward scaling, parameter groups and their optimizer."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def make_loss(
     bins: int,
     **options: Any,
 ) -> LeanSACLoss:
-    """SAC's losses, of actions or of the synergies that a decoder turns into actions."""
+    """SAC losses over actions, or over synergies that ``decoder`` maps to actions."""
     check_real("[0, 1)", gamma=gamma)
     check_real("(0, inf)", alpha_init=alpha_init)
     check_integer(1, num_critics=num_critics, bins=bins)
@@ -68,7 +68,7 @@ def make_loss(
 
 
 def make_return_scale(gamma: float, return_bound: float | None) -> ReturnScale | None:
-    """What divides the reward so that returns stay within the bound, if there is one."""
+    """Reward scaling that keeps returns within ±``return_bound``; ``None`` without a bound."""
     if return_bound is None:
         return None
     with renaming(bound="return_bound"):
@@ -78,7 +78,7 @@ def make_return_scale(gamma: float, return_bound: float | None) -> ReturnScale |
 def from_observation(
     actor: TensorDictModuleBase, normalizer: RunningNorm | None, decoder: SynergyMap | None
 ) -> TensorDictModuleBase:
-    """An actor as it acts in an environment: on raw observations, with decoded actions."""
+    """Wrap an actor to act in an environment: it reads raw observations and writes actions."""
     before, after = [], [] if decoder is None else [decoder]
     if normalizer is not None:
         before = [TensorDictModule(normalizer, ["observation"], [NORMALIZED])]
@@ -86,9 +86,9 @@ def from_observation(
 
 
 def entropy_target(action_spec: Bounded, action_std: float | None) -> float:
-    """Entropy of a Gaussian with ``action_std`` per dimension, in units where the bounds are ±1.
+    """Entropy of a Gaussian whose std in each dimension is ``action_std`` times the half range.
 
-    ``None`` gives SAC's usual minus the number of dimensions.
+    ``None`` gives SAC's usual target, minus the number of dimensions.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -105,7 +105,7 @@ def entropy_target(action_spec: Bounded, action_std: float | None) -> float:
 
 
 def support(bins: int, bound: float | None) -> Tensor | None:
-    """Where categorical critics put the return; ``None`` for critics of one output.
+    """Atoms of categorical critics; ``None`` for scalar critics (``bins=1``).
 
     Examples:
         >>> support(3, 5.0)
@@ -122,15 +122,15 @@ def support(bins: int, bound: float | None) -> Tensor | None:
 
 
 def drawn_in(inputs: TensorDictBase) -> AbstractContextManager[None]:
-    """Losses take the random numbers of these inputs of an update."""
+    """Context in which losses take their random numbers from ``inputs["draws"]``."""
     draws = inputs["draws"]
     return given_draws(draws[f"{i}"] for i in range(len(draws.keys())))
 
 
 def episode_numbers(batch: TensorDictBase) -> Tensor:
-    """A number for the episode of each transition [*].
+    """An episode number for each transition [*], unique across workers.
 
-    Workers of one machine number theirs together, those on other machines each on their own.
+    Workers of one machine share a numbering; each remote worker has its own.
     """
     number = batch["collector", "traj_ids"]
     worker = batch.get(("collector", "worker"), None)
@@ -144,7 +144,7 @@ def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
 
 
 def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
-    """What is trained, each parameter once: a term's own at its learning rate, then SAC's."""
+    """All trainable parameters, each once: those of terms at their own rates, then SAC's."""
     groups, known = [], set()
     of_terms = ((term.loss, lr if term.lr is None else term.lr) for term in terms)
     for module, rate in (*of_terms, (sac, lr)):
@@ -156,9 +156,9 @@ def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[d
 
 
 def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> GradientAdam:
-    """Adam that takes all steps in one operation, which a CUDA graph can hold.
+    """Fused Adam, which a CUDA graph can capture.
 
-    It reads learning rates from tensors there, so that they can change.
+    On CUDA it keeps learning rates in tensors, so that they can change after the capture.
     """
     graphed = device.type == "cuda"
     if graphed:

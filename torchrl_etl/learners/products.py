@@ -1,8 +1,8 @@
-"""Matrix products of a compiled update by oneDNN, where PyTorch's own are slower.
+"""Matrix products of a compiled update through oneDNN where it is faster than MKL.
 
-PyTorch multiplies by MKL, which leaves AVX-512 of AMD's processors alone (torch 2.13): half of the
-speed of oneDNN, which PyTorch has too and gives no function for. Where that is so, a product of
-one row or column becomes a sum.
+On AMD processors MKL, PyTorch's default (torch 2.13), does not use AVX-512 and runs at half the
+speed of oneDNN. PyTorch includes oneDNN but has no public function for it. Where oneDNN is used,
+products with a single row or column become sums.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch import Tensor
 
 __all__ = ["by_onednn", "faster_products", "multiply"]
 
-_SMALLEST = 16  # of either side; MKL is faster below
+_SMALLEST = 16  # size of each outer dimension; below, MKL is faster
 
 
 def multiply(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
-    """a [m, k] times b [k, n], and the bias [n] added, as :func:`torch.addmm` does."""
+    """Product of a [m, k] and b [k, n] plus the bias [n], as :func:`torch.addmm`."""
     return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "none", [], "")
 
 
@@ -34,9 +34,9 @@ def _(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
 
 @cache
 def faster_products() -> dict[Any, Callable[..., Any]]:
-    """What :func:`~torch.fx.experimental.proxy_tensor.make_fx` is to trace in place of products.
+    """Decompositions of products for :func:`~torch.fx.experimental.proxy_tensor.make_fx`.
 
-    Empty where oneDNN was not found to be faster: without AVX-512 they are about level.
+    Empty where oneDNN is not known to be faster: without AVX-512 both are about equally fast.
     """
     capability = torch.backends.cpu.get_cpu_capability()
     if capability != "AVX512" or not torch.backends.mkldnn.is_available():
@@ -45,19 +45,19 @@ def faster_products() -> dict[Any, Callable[..., Any]]:
     from torch._inductor.lowering import fallback_handler, permute, register_lowering
 
     linear = torch.ops.mkldnn._linear_pointwise.default
-    # Inductor's own way for this operation is for weights that never change.
+    # Inductor's own lowering of this operation requires constant weights.
     call = fallback_handler(linear, add_to_fallback_set=False)
 
     @register_lowering(torch.ops.torchrl_etl.product.default, type_promotion_kind=None)
     def lower(a: Any, b: Any, bias: Any) -> Any:
-        # The kernel that makes it lays it out; oneDNN's operation would copy it, and slower.
+        # Let the producing kernel write it contiguously; oneDNN would copy it, which is slower.
         return call(ExternKernel.require_contiguous(a), permute(b, [1, 0]), bias, "none", [], "")
 
     return {torch.ops.aten.mm.default: _mm, torch.ops.aten.addmm.default: _addmm}
 
 
 def by_onednn(a: Tensor, b: Tensor) -> bool:
-    """Whether it is faster for these where :func:`faster_products` has any."""
+    """Whether oneDNN is faster for this product, if :func:`faster_products` is not empty."""
     plain = a.dtype == torch.float32 and a.device.type == "cpu"
     return plain and min(*a.shape, b.shape[1]) >= _SMALLEST
 
@@ -72,15 +72,15 @@ def _addmm(bias: Tensor, a: Tensor, b: Tensor, *, beta: float = 1, alpha: float 
     if beta != 1 or alpha != 1 or bias.shape != b.shape[1:]:
         return NotImplemented
     if by_onednn(a, b):
-        # oneDNN takes no notice of a bias's strides.
+        # oneDNN ignores the strides of a bias.
         return torch.ops.torchrl_etl.product(a, _dense(b), bias.contiguous())
     total = _as_sum(a, b)
     return total if total is NotImplemented else bias + total
 
 
 def _as_sum(a: Tensor, b: Tensor) -> Tensor:
-    """A product with one row, one column or one inner index, which then joins the kernel that
-    makes its factors or reads it: a critic's single output, and its gradients."""
+    """A product with one row, one column or one inner index, written as a sum so that it fuses with
+    neighboring kernels; a critic's single output and its gradients are such products."""
     if a.device.type == "cpu" and a.dtype.is_floating_point:
         if a.shape[1] == 1:
             return a * b
@@ -92,6 +92,6 @@ def _as_sum(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _dense(b: Tensor) -> Tensor:
-    """oneDNN has no kernel for some columns of a larger matrix, and then takes a thousand times as
-    long."""
+    """Copy a column slice of a larger matrix: oneDNN has no kernel for it and takes a thousand
+    times as long."""
     return b if b.is_contiguous() or b.t().is_contiguous() else b.contiguous()

@@ -1,4 +1,4 @@
-"""Soft actor-critic: everything that one update touches, and the update."""
+"""Soft actor-critic: the state of a learner and its update."""
 
 from __future__ import annotations
 
@@ -47,46 +47,46 @@ Gradients: TypeAlias = tuple[tuple[Tensor | None, ...], TensorDictBase, tuple[Te
 class SACLearner:
     """Soft actor-critic that owns its networks, targets, statistics and optimizer.
 
-    Both stages of ETL and all its rivals are this class with other objects handed to it.
+    Both stages of ETL and all baselines use this class, each with its own components.
 
     Args:
-        actor (ProbabilisticTensorDictSequential): emits an action, or with a decoder synergies.
-        critic (TensorDictModule): values an action; it is copied ``num_critics`` times.
+        actor (ProbabilisticTensorDictSequential): writes an action, or what ``decoder`` reads.
+        critic (TensorDictModule): Q-network, copied ``num_critics`` times.
 
     Keyword Args:
-        action_spec (Bounded): what the actor emits, unbatched.
-        decoder (SynergyMap, optional): turns what the actor emits into actions.
-        train_decoder (bool): let the actor loss reach the decoder. Default: ``False``.
-        behavior (TensorDictModuleBase, optional): the actor with its exploration noise, which
-            collects. Default: the actor.
-        terms (sequence of Term): further losses. Default: none.
-        transforms (sequence of Transform): what each batch goes through at its update, with all
-            networks as they are by then: a bonus, say. What one reads and does not hold is in its
-            attribute ``networks``. Default: none.
-        normalizer (RunningNorm, optional): the networks read
-            :data:`~torchrl_etl.learners.NORMALIZED`, which it makes of ``observation``.
-        reward (NestedKey): what SAC learns on. Default: ``"reward"``.
+        action_spec (Bounded): spec of the actor's output, unbatched.
+        decoder (SynergyMap, optional): maps the actor's output to actions.
+        train_decoder (bool): train the decoder on the actor loss. Default: ``False``.
+        behavior (TensorDictModuleBase, optional): policy that collects, such as the actor with
+            exploration noise. Default: the actor.
+        terms (sequence of Term): losses to minimize besides SAC's. Default: none.
+        transforms (sequence of Transform): applied to each batch at its update, when they see the
+            current networks; an intrinsic bonus, for example. The attribute ``networks`` of a
+            transform lists networks that it reads but does not own. Default: none.
+        normalizer (RunningNorm, optional): normalizes ``observation`` to
+            :data:`~torchrl_etl.learners.NORMALIZED`, which actor and critic must then read.
+        reward (NestedKey): reward that SAC learns from, below ``"next"``. Default: ``"reward"``.
         gamma (float): discount factor. Default: 0.99.
         tau (float): EMA rate of the target critics. Default: 0.005.
-        lr, lr_end (float): learning rate, and the share of all learning rates that is left at the
-            last frame; they fall linearly. Default: 3e-4 and 1.
-        ema_decay (float): decay of the EMA of the actor that is evaluated and saved. Default: 0.
+        lr, lr_end (float): initial learning rate, and the fraction of every learning rate that is
+            left at the last frame (linear decay). Default: 3e-4 and 1.
+        ema_decay (float): EMA decay of the actor that is evaluated and saved. Default: 0.
         alpha_init (float): initial temperature. Default: 1.
         target_entropy (float or "auto"): see :func:`entropy_target`. Default: ``"auto"``.
-        counted (int, optional): entropy is that of so many leading entries of what the actor
-            emits. Default: of the action.
-        num_critics (int): the smallest of whose values counts. Default: 2.
-        loss_function (str): error of scalar critics. Default: ``"l2"``.
-        return_bound (float, optional): rewards are scaled so that returns stay within it.
-        bins (int): above 1, critics are categorical with so many returns in ±``return_bound``.
-        unit_rows (bool): rows of all linear layers keep unit length. Default: ``False``.
-        on_frames (sequence of callable): told the number of frames after each batch.
-        on_restart (sequence of callable): told, where new episodes begin, how many actions each
-            worker has taken; parts of the behavior policy that count actions go on from there.
-        compile (bool): compile updates; on CUDA they also become one CUDA graph.
+        counted (int, optional): measure the entropy of the first ``counted`` actor outputs only.
+            Default: entropy of the action.
+        num_critics (int): ensemble size; targets and actor loss use the minimum. Default: 2.
+        loss_function (str): loss of scalar critics. Default: ``"l2"``.
+        return_bound (float, optional): scale rewards so that returns stay within ± this bound.
+        bins (int): above 1, critics are categorical with ``bins`` atoms in ±``return_bound``.
+        unit_rows (bool): keep the rows of all linear layers at unit norm. Default: ``False``.
+        on_frames (sequence of callable): called with the frame count after each batch.
+        on_restart (sequence of callable): called when new episodes begin, with the number of
+            actions that each worker has taken, so that counters in ``behavior`` can resume.
+        compile (bool): compile updates; on CUDA, also capture each as one CUDA graph.
 
     Raises:
-        ValueError: for categorical critics without a bound on returns.
+        ValueError: if a number is out of range, or ``bins`` is above 1 without ``return_bound``.
 
     Examples:
         >>> import torch
@@ -163,26 +163,26 @@ class SACLearner:
         self._step_along(self.gradients)
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Learn from a batch of transitions [B]; returns scalars to log."""
+        """Update on a batch of transitions [B]; returns scalars to log."""
         return self.updates(self.inputs(batch.unsqueeze(0)))[0]
 
     def updates(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Learn from :meth:`inputs` [k], one after the other; returns scalars to log [k]."""
+        """Run k updates on :meth:`inputs` [k], in order; returns scalars to log [k]."""
         scalars = []
         for each in inputs.unbind(0):
             scalars.append(self._step(each))
-            self.ema.follow()  # counts in Python: no part of a CUDA graph
+            self.ema.follow()  # reads its count in Python, so it is not part of a CUDA graph
         return torch.stack(scalars)
 
     def inputs(self, batches: TensorDictBase) -> TensorDictBase:
-        """What updates read [k]: under ``batch`` these batches [k, B], and under ``draws`` the
-        random numbers of each, in the order in which the objective takes them."""
+        """Inputs of k updates: these batches [k, B] under ``batch``, and under ``draws`` the random
+        numbers of each update in the order in which the objective consumes them."""
         drawn = self._draw(len(batches), batches[0])
         draws = TensorDict({f"{i}": each for i, each in enumerate(drawn)}, [len(batches)])
         return TensorDict({"batch": batches, "draws": draws}, [len(batches)])
 
     def step(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Critics, actor, temperature and terms take a gradient step; their targets follow."""
+        """Update networks, temperature, targets and statistics once; returns scalars to log."""
         gradients, scalars, statistics = self._gradients(inputs)
         self.descend(gradients)
         if statistics:
@@ -190,31 +190,31 @@ class SACLearner:
         return scalars
 
     def descend(self, gradients: Sequence[Tensor | None]) -> None:
-        """A step of the optimizer along gradients in the order of ``parameters``."""
+        """Take an optimizer step along gradients in the order of ``parameters``; move targets."""
         self.optimizer.step_along(gradients)
         normalize_rows(self.unit_rows)
         for target in self.targets:
             target.step()
 
     def gradients(self, inputs: TensorDictBase) -> Gradients:
-        """Those of the objective, in the order of ``parameters``; nothing is changed."""
+        """Gradients of the objective in the order of ``parameters``. Changes no state."""
         loss, scalars, statistics = self.loss(inputs)
         gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         return gradients, scalars.detach(), statistics
 
     def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
-        """The objective, with these random numbers, scalars to log, and new statistics."""
+        """The objective on these inputs, scalars to log, and new statistics. Changes no state."""
         with drawn_in(inputs):
             return self._loss(inputs["batch"])
 
     def _loss(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
         statistics = {name: self.objective.get_buffer(name).clone() for name in self.statistics}
-        # One module of two names would be left with the copies if those were tied.
+        # Tying weights would leave the copies in a module that is registered under two names.
         loss, scalars = functional_call(self.objective, statistics, (batch,), tie_weights=False)
         return loss, scalars, tuple(statistics.values())
 
     def only(self, *terms: Term) -> SACLearner:
-        """A learner that takes steps on these terms alone, with this one's optimizer."""
+        """A learner that minimizes these terms only and shares this learner's optimizer."""
         twin = copy(self)
         twin.objective = self.objective.only(*terms)
         twin.statistics, twin.unit_rows = {}, []
@@ -226,7 +226,7 @@ class SACLearner:
         return twin
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Take a batch [simulators, time] as it was collected into the running statistics."""
+        """Update the running statistics with a collected batch [simulators, time]."""
         if self.objective.return_scale is not None:
             reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
             self.objective.return_scale.update(reward, done, episode_numbers(batch))
@@ -234,32 +234,32 @@ class SACLearner:
             self.objective.normalizer.see(batch["observation"])
 
     def restart(self, actions: int) -> None:
-        """All episodes begin anew, when each worker has taken so many actions."""
+        """Prepare for new episodes in all simulators, after ``actions`` actions of each worker."""
         if self.objective.return_scale is not None:
             self.objective.return_scale.forget()
         for tell in self.on_restart:
             tell(actions)
 
     def advance(self, frames: int, progress: float) -> None:
-        """Set what depends on the number of frames, and on the share of all frames that it is."""
+        """Set learning rates by ``progress``, the share of frames collected; call ``on_frames``."""
         self.optimizer.scale_rates(1.0 - (1.0 - self.lr_end) * min(1.0, progress))
         for tell in self.on_frames:
             tell(frames)
 
     @property
     def num_updates(self) -> int:
-        """Updates up to now, as the optimizer has counted them."""
+        """Updates so far, as counted by the optimizer."""
         return self.optimizer.steps_of(self._stepped)
 
     @property
     def pace(self) -> tuple[float, ...]:
-        """How far a step goes now: number of updates, learning rates, rates of targets and EMA."""
+        """Step sizes in effect: update count, learning rates, target-network and EMA rates."""
         targets = (target.eps for target in self.targets)
         return self.num_updates, *self.optimizer.rates, *targets, self.ema.decay
 
     @property
     def state(self) -> list[Tensor]:
-        """All that an update changes, each tensor once, except the numbers of updates."""
+        """Every tensor that an update modifies, without duplicates, except update counters."""
         followers = [tensor for target in self.targets for tensor in target.followers]
         found = *self.parameters, *followers, *self.ema.tensors, *self.optimizer.moments
         found += tuple(self.statistics.values())
@@ -268,7 +268,7 @@ class SACLearner:
     def over(
         self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Gradients]
     ) -> SACLearner:
-        """A learner of the same updates along other gradients, of other parameters and targets."""
+        """A copy that updates ``other(tensor)`` for each tensor, along these gradients."""
         twin = copy(self)
         twin.parameters = list(map(other, self.parameters))
         twin.unit_rows = list(map(other, self.unit_rows))
@@ -286,7 +286,7 @@ class SACLearner:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """What a checkpoint holds; ``policy`` alone is what a trained learner acts by."""
+        """Components of a checkpoint; a trained learner acts by ``policy`` alone."""
         return {
             "policy": self.policy,
             "objective": self.objective,

@@ -1,4 +1,4 @@
-"""Several learners, one a seed, whose gradients are computed together."""
+"""Several learners, one per seed, whose gradients are computed together."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ __all__ = ["SideBySide"]
 
 
 class SideBySide:
-    """Updates learners of one make as each would be by itself, with one pass through the networks.
+    """Updates learners of equal architecture in one pass, as if each were updated alone.
 
-    The objective is that of the first learner, under :func:`torch.vmap` over what all of them hold,
-    stacked, and its optimizer, targets and EMA take their steps on the stacks: there is no second
-    set of equations. What an update changes is taken from the learners before updates and given
-    back after them. The pass is compiled if theirs are.
+    It runs the objective of the first learner under :func:`torch.vmap` over the stacked tensors of
+    all learners. The first learner's optimizer, targets and EMA then update the stacks, so no
+    equation is implemented twice. Tensors are copied from the learners before updates and back
+    afterwards. The pass is compiled if the learners' updates are.
 
     Args:
-        learners (sequence of SACLearner): of equal sizes, bounds and settings, after equally many
-            updates; weights, statistics and whatever else their modules hold as buffers may differ.
+        learners (sequence of SACLearner): of equal sizes, bounds, settings and update counts;
+            weights, statistics and other buffers may differ.
 
     Raises:
-        ValueError: if there is no learner, or one has parameters of other shapes; at an update if
-            learners differ in how many they have had, or in learning rates, tau or EMA decay; at
-            the first one if a transform reads a network that is not known to be its own.
+        ValueError: if there is no learner, or if parameter shapes differ; at an update, if update
+            counts, learning rates, tau or EMA decay differ; at the first update, if a transform
+            reads a network that is neither its submodule nor among its ``networks``.
 
     Examples:
         >>> import torch
@@ -71,8 +71,8 @@ class SideBySide:
         self._all = learners[0].over(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-        """Every learner learns from its own :meth:`SACLearner.inputs` [k], one after the other;
-        returns the scalars [k] of each."""
+        """Run k updates of every learner on its own :meth:`SACLearner.inputs` [k]; returns the
+        scalars [k] of each."""
         self._take()
         stacked = torch.stack(list(inputs), 1)
         if not self._checked:
@@ -83,10 +83,10 @@ class SideBySide:
         return list(scalars.unbind(1))
 
     def gradients(self, inputs: TensorDictBase) -> Gradients:
-        """As :meth:`SACLearner.gradients` of each, stacked: [seeds, ...].
+        """Stacked :meth:`SACLearner.gradients` of all learners [seeds, ...].
 
         Args:
-            inputs (TensorDictBase): :meth:`SACLearner.inputs` of all, stacked: [seeds].
+            inputs (TensorDictBase): stacked :meth:`SACLearner.inputs` of all learners [seeds].
         """
         first = self.learners[0]
 
@@ -100,7 +100,7 @@ class SideBySide:
 
     @torch.no_grad()
     def _check(self, inputs: TensorDictBase) -> None:
-        """Refuse transforms that give every learner what the first's networks would."""
+        """Raise if a transform evaluates the first learner's networks for every learner."""
         first = self.learners[0].objective
 
         def reward(objective: Objective, own: TensorDictBase) -> Tensor:
@@ -126,8 +126,8 @@ class SideBySide:
                 )
 
     def _held(self) -> TensorDictBase:
-        """What the learners' objectives hold or read [seeds]: stacks, or what no update changes,
-        stacked anew."""
+        """Tensors that the learners' objectives hold or read [seeds]: the stacks, and constant
+        tensors stacked on the fly."""
 
         def stacked(*own: Tensor) -> Tensor:
             found = self._stacks.get(id(own[0]))
@@ -137,7 +137,7 @@ class SideBySide:
         return held.apply(stacked, *others, batch_size=[len(self.learners)])
 
     def _stack(self, own: Tensor) -> Tensor:
-        """Where a tensor of the first learner is updated, with those of the others."""
+        """The stack in which a tensor of the first learner and its counterparts are updated."""
         if id(own) not in self._stacks:
             stack = own.new_empty(len(self.learners), *own.shape)
             self._stacks[id(own)] = nn.Parameter(stack) if own.requires_grad else stack
@@ -165,20 +165,20 @@ class SideBySide:
             learner.ema.n_averaged.copy_(self._all.ema.n_averaged)
 
     def _rows_and_own(self) -> tuple[list[Tensor], list[Tensor]]:
-        """What the stacks hold, learner by learner, and what the learners do."""
+        """Rows of the stacks, learner by learner, and the learners' own tensors."""
         rows = zip(*(stack.unbind(0) for stack in self._all.state), strict=True)
         own = (learner.state for learner in self.learners)
         return [row for each in rows for row in each], [tensor for each in own for tensor in each]
 
 
 def whole(objective: Objective) -> nn.Module:
-    """An objective, and what its transforms read."""
+    """An objective with the networks that its transforms read."""
     return nn.ModuleList([objective, *objective.networks])
 
 
 @contextmanager
 def _as_it_was(learner: SACLearner) -> Iterator[None]:
-    """The statistics of its transforms are not changed."""
+    """Restore the statistics of the learner's transforms on exit."""
     before = [each.clone() for each in learner.statistics.values()]
     try:
         yield

@@ -1,4 +1,4 @@
-"""One more objective of a learner."""
+"""An additional loss of a learner."""
 
 from __future__ import annotations
 
@@ -15,19 +15,17 @@ __all__ = ["Term"]
 
 
 class Term(nn.Module):
-    """A loss that a learner minimizes beside SAC's, on the same batch and with the same optimizer.
+    """A loss that a learner minimizes besides SAC's, on the same batch with the same optimizer.
 
     Args:
-        loss (LossModule): writes entries named ``loss_*``, which are summed, and scalars to log.
+        loss (LossModule): writes entries ``loss_*``, which are summed, and scalars to log.
 
     Keyword Args:
-        weight (float): of the sum in what the learner minimizes; at 0 it is only logged.
-            Default: 1.
-        lr (float, optional): learning rate of the parameters that this loss holds. Default: that
-            of the learner.
-        tau (float, optional): how fast the loss's target networks follow, as an EMA.
-            Default: ``None``, there are none.
-        inputs (callable, optional): makes what the loss reads out of a batch. Default: the batch.
+        weight (float): weight of the summed losses; at 0 they are only logged. Default: 1.
+        lr (float, optional): learning rate of the loss's parameters. Default: the learner's.
+        tau (float, optional): EMA rate of the loss's target networks.
+            Default: ``None``, no target networks.
+        inputs (callable, optional): maps a batch to the input of the loss. Default: identity.
 
     Raises:
         ValueError: if the weight is negative, the learning rate is not positive, or tau is outside
@@ -65,7 +63,7 @@ class Term(nn.Module):
         self.target = None if tau is None else FusedSoftUpdate(loss, tau=tau)
 
     def forward(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """What is minimized, weighted, and what is logged."""
+        """The weighted loss, and scalars to log."""
         out = self.loss(batch if self.inputs is None else self.inputs(batch))
         losses = [value for key, value in out.items() if key.startswith("loss_")]
         return self.weight * sum(losses), out

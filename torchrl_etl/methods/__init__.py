@@ -1,4 +1,4 @@
-"""ETL, its control and its rivals, one a file."""
+"""ETL, plain SAC and the baselines, one per file."""
 
 from collections.abc import Mapping
 
@@ -22,4 +22,4 @@ METHODS: Mapping[str, type[Method]] = {
     "eme": EME,
     "sar": SAR,
 }
-"""Methods by name; ``"my_module:MyMethod"`` names one's own."""
+"""Methods by name; ``"my_module:MyMethod"`` names a user's own."""

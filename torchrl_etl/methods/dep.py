@@ -1,4 +1,4 @@
-"""DEP (Schumacher 2023): now and then a controller of muscle lengths acts instead of the policy."""
+"""DEP (Schumacher 2023): at times a controller of muscle lengths replaces the policy."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ __all__ = ["DEP"]
 
 
 class DEP(Method):
-    """SAC whose actor is followed by DEP's controller.
+    """SAC with DEP's controller after the actor.
 
-    Learning starts when DEP has acted alone, as in the public code: ``learn.learning_starts`` is
-    ``dep_frames`` in its files of ``method/``.
+    Learning starts after the frames in which DEP acts alone, as in the public code: DEP's files in
+    ``method/`` set ``learn.learning_starts`` to ``dep_frames``.
 
-    Deviates: its authors' learner is MPO; here it is SAC, the same as everyone's.
+    Deviates: the authors' learner is MPO; here it is SAC, as for all methods.
 
-    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, but ``dep_frames``
-    counts frames of the run, those of all workers.
+    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, except that
+    ``dep_frames`` counts the frames of all workers.
     """
 
     takes = ("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau")

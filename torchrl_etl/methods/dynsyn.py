@@ -28,15 +28,15 @@ __all__ = ["DynSyn"]
 
 
 class DynSyn(Method):
-    """SAC with one action a group; muscles are grouped while joints are thrown about.
+    """SAC with one action per group of muscles, grouped by their lengths under random joint motion.
 
-    Its actor's distribution is its own, with the noise in it.
+    The actor has its own distribution, which includes the exploration noise.
 
-    Options: ``frames`` of the recording, which are charged, ``amplitude`` of joint velocities in
-    it and ``group_share``, groups per muscle (one number, or one for ``legs`` and one for
-    ``hands``), and keyword arguments of :func:`~torchrl_etl.baselines.make_dynsyn_actor`; with
-    ``start_share`` in place of ``start`` and ``slope``, weights deviate from that share of the
-    stage's frames on, linearly up to their ceiling at the last frame.
+    Options: ``frames`` of the recording, which count toward the budget; ``amplitude`` of its
+    joint velocities; ``group_share``, groups per muscle; and keyword arguments of
+    :func:`~torchrl_etl.baselines.make_dynsyn_actor`. ``amplitude`` and ``group_share`` may have one
+    value for ``legs`` and one for ``hands``. ``start_share`` replaces ``start`` and ``slope``:
+    weights deviate after that share of the stage's frames, linearly up to ``ceiling`` at the last.
     """
 
     fixed = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
@@ -63,10 +63,10 @@ class DynSyn(Method):
         return {"groups": self.groups}
 
     def found_groups(self, stop: StopOnSignal) -> list[int]:
-        """The group of each muscle, by its length while joints are thrown about."""
+        """The group of each muscle, from muscle lengths recorded under random joint motion."""
         seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
         lengths = record_muscle_lengths(
-            self.context.make_env(action_repeat=1),  # a recorded step is a frame
+            self.context.make_env(action_repeat=1),  # one recorded step is one frame
             self.charged,
             amplitude=self.amplitude,
             seed=2**30 + seed,
@@ -101,7 +101,7 @@ class DynSyn(Method):
             return make_dynsyn_actor(inputs, spec, groups, **options, **deviation)
 
         def entropy(spec: Bounded, action_std: float | None) -> float:
-            # The actor's log-probability counts one dimension a group.
+            # The actor's log-probability has one dimension per group.
             first = [groups.index(group) for group in sorted(set(groups))]
             return entropy_target(spec[first], action_std)
 

@@ -1,4 +1,4 @@
-"""EME (Wang 2024): a bonus for steps that are long in a metric of reward and policy."""
+"""EME (Wang 2024): a bonus for transitions that are long in a metric of reward and policy."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["EME"]
 
 
 class EME(Method):
-    """SAC on reward plus bonus, the metric trained beside it.
+    """SAC on reward plus bonus, with the metric trained alongside.
 
-    Bonus and metric are of single steps, so the critics' targets are too. The metric has the
-    discount of the learner.
+    Bonus and metric are defined on single steps, so critics use one-step targets. The metric uses
+    the learner's discount.
 
     Deviates: built on SAC from the paper's equations; see :class:`~torchrl_etl.baselines.EMELoss`.
 

@@ -1,4 +1,4 @@
-"""Explore to Learn: synergies from exploration, then the task in synergies (Algorithm 1)."""
+"""Explore to Learn: explore to find synergies, then learn the task in them (Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ __all__ = ["ETL", "FineTuning"]
 
 FineTuning = Literal["critic", "reconstruction", "frozen"]
 BODY = "body"
-"""What ``synergies=`` calls those that a body's moment arms give."""
+"""Value of ``synergies=`` that computes synergies from the body's moment arms."""
 MOST_SYNERGIES = 8
-"""d of bodies with at least twice as many actuators, among them all of the paper's tasks."""
+"""d of bodies with at least twice as many actuators, which include all of the paper's tasks."""
 
 
 def default_num_synergies(actuators: int) -> int:
-    """d for a body: half of its actuators, between 1 and 8.
+    """Default d for a body: half of its number of actuators, between 1 and 8.
 
     Examples:
         >>> [default_num_synergies(n) for n in (1, 6, 21, 80)]
@@ -55,13 +55,13 @@ def default_num_synergies(actuators: int) -> int:
 
 
 class ETL(Method):
-    """Algorithm 1: explore and condense, or take a bundle; then SAC on synergy coefficients.
+    """Algorithm 1: explore and extract synergies, or load a bundle; then SAC on their coefficients.
 
-    The bundle is one of another run, of the zoo, or of the body's moment arms.
+    A bundle comes from another run, from the zoo, or from the body's moment arms.
 
-    The decoder is fine-tuned in one of three ways: ``"critic"`` (the actor loss runs through it,
-    Eq. 10 with ``distillation_weight`` keeps it from drifting), ``"reconstruction"`` (Eq. 10 alone,
-    as printed) or ``"frozen"``.
+    Fine-tuning of the decoder is ``"critic"`` (trained on the actor loss, with Eq. 10 weighted by
+    ``distillation_weight`` against drift), ``"reconstruction"`` (Eq. 10 only, as printed) or
+    ``"frozen"``.
 
     Deviates: see :class:`~torchrl_etl.objectives.SynergySACLoss`,
     :class:`~torchrl_etl.objectives.DecoderLoss`, and ``docs/faithfulness.md``.
@@ -93,10 +93,10 @@ class ETL(Method):
         self.prefills = config.learn.prefill
 
     def _settle_given(self) -> None:
-        """Look at the synergies that were given; those of the body are made, once in a run."""
+        """Check the given synergies; compute the body's, if asked for and not saved already."""
         config, space = self.context.config, self.context.spec
         given, own = config.synergies.bundle, self.context.folder.synergies
-        # The absolute path stands in the run's configuration.
+        # Store the absolute path in the run's configuration.
         absolute = given if given == BODY else str(zoo.bundle_path(given).resolve())
         self.explores_nothing(bundle=absolute)
         config.stage = "learn"
@@ -111,7 +111,7 @@ class ETL(Method):
         check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
 
     def _settle_num_synergies(self) -> None:
-        """Without a number, take one for the body; refuse more synergies than actuators."""
+        """Fill in a missing number of synergies; refuse more synergies than actuators."""
         config, actuators = self.context.config, self.context.spec.action_dim
         if config.num_synergies is None:
             config.num_synergies = default_num_synergies(actuators)
@@ -135,7 +135,7 @@ class ETL(Method):
         self.stage()
 
     def _try_out(self, model: SynergyModel) -> None:
-        """Refuse a model whose decoder no bundle can hold: stage 1 takes hours to find out."""
+        """Refuse a model whose decoder cannot be saved in a bundle, before stage 1 takes hours."""
         actions = self.context.spec.action_spec.rand((256,))
         if model.loss is None:
             model.fit(actions)
@@ -151,7 +151,7 @@ class ETL(Method):
 
     @property
     def bundle(self) -> Path:
-        """Where the synergies are: in the run folder, or until they are copied where given."""
+        """Path of the synergies: in the run folder once saved there, before that as given."""
         own, given = self.context.folder.synergies, self.context.config.synergies.bundle
         if given is None or surviving_folder(own).exists():
             return own
@@ -165,17 +165,17 @@ class ETL(Method):
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         if self.of_body is not None:
             self._save(self.of_body, BODY, frames=0)
-        elif self.given:  # a run holds all it needs, wherever it is moved
+        elif self.given:  # keeps the run folder complete, wherever it is moved
             copy_bundle(self.bundle, self.context.folder.synergies)
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             yield from self._explore(stop)
         _, info = self._load()
-        if not self.given:  # whole batches were collected, a few frames more than the budget
+        if not self.given:  # whole batches may exceed the budget by a few frames
             self.charged = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
 
     def _explore(self, stop: StopOnSignal) -> Work[None]:
-        """Explore and leave a bundle in the run folder; that it is there says that this is done."""
+        """Explore and save a bundle in the run folder; its presence marks stage 1 as complete."""
         context, explorer = self.context, Explorer(self.context)
         stage = explorer.stage
         yield from context.run_stage(stage, stop)
@@ -184,7 +184,7 @@ class ETL(Method):
         try:
             if (embedded := explorer.exploration.embed(stage.newest(20_000))) is not None:
                 numbers["direction_alignment"] = direction_alignment(*embedded)
-        except Exception as error:  # of a class of one's own, after hours: the synergies come first
+        except Exception as error:  # in a user's class, after hours: still save the synergies
             warnings.append(f"the exploration could not embed its transitions ({error!r}).")
         numbers["frames"] = stage.frames
         for warning in warnings:
@@ -198,7 +198,7 @@ class ETL(Method):
         self._save(decoder, explorer.model.kind, **numbers, seed=context.config.seed)
 
     def _save(self, decoder: SynergyDecoder, kind: str, **known: Any) -> None:
-        """Leave the bundle of this run in its folder."""
+        """Save the bundle in the run folder."""
         config = self.context.config
         save_bundle(
             decoder,
@@ -232,13 +232,13 @@ class ETL(Method):
             )
             if (embedded := explorer.exploration.embed(explorer.stage.newest(5000))) is not None:
                 embedding(*embedded, folder / "embedding.png")
-        except Exception as error:  # whatever a picture meets, the synergies are worth keeping
+        except Exception as error:  # still save the synergies
             context.say(f"Warning: the pictures of the synergies could not be drawn ({error}).")
 
     # Stage 2 -----------------------------------------------------------------------------------
 
     def decoder(self) -> SynergyDecoder | None:
-        """The decoder that was given, explored or made, if it is there by now."""
+        """The decoder that was given, explored or computed, if it is available already."""
         there = self.given and self.of_body is None
         if there or surviving_folder(self.context.folder.synergies).exists():
             return self._load()[0]
@@ -261,7 +261,7 @@ class ETL(Method):
         return self.learn_stage(self._placeholder() if decoder is None else decoder)
 
     def learn_stage(self, decoder: SynergyDecoder) -> Stage:
-        """Stage 2 with this decoder, before its first frame."""
+        """Build stage 2 with this decoder."""
         options = self.context.options("learn")["decoder"]
         with naming("learn.decoder"):
             check_choice("fine_tuning", mode := options["fine_tuning"], get_args(FineTuning))
@@ -272,7 +272,7 @@ class ETL(Method):
         decoder = decoder.to(self.context.device).requires_grad_(mode != "frozen")
         with naming("learn.decoder"), renaming(weight="distillation_weight"):
             term = Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])
-        # A residual of fixed noise has no entropy of the policy's choice.
+        # The policy does not control the entropy of a residual with fixed noise.
         counted = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
         self.context.seed_everything("learn")
         learner = self.context.learner(
@@ -293,7 +293,7 @@ class ETL(Method):
 
     @property
     def _quiet(self) -> dict[str, Any]:
-        """Arguments of the actor where the noise of the residual is fixed."""
+        """Arguments of the actor if the residual has a fixed standard deviation."""
         std = self.context.config.learn.decoder.residual_std
         return {} if std is None else {"quiet": self.context.spec.action_dim, "quiet_std": std}
 
@@ -302,7 +302,7 @@ class ETL(Method):
             stage.prefill(self._explored(stage.learner.decoder))
 
     def _placeholder(self) -> SynergyDecoder:
-        """An untrained decoder of the sizes that the configuration asks for."""
+        """An untrained decoder of the configured sizes."""
         spec, config = self.context.spec, self.context.config
         return SynergyDecoder(
             config.num_synergies,
@@ -313,7 +313,7 @@ class ETL(Method):
         )
 
     def _explored(self, decoder: SynergyDecoder) -> TensorDict:
-        """The transitions that stage 1 left; where there is a residual, theirs is zero."""
+        """Transitions saved by stage 1, with a residual of zero if the decoder has one."""
         file = self.context.folder.explored
         try:
             tensors = safetensors.torch.load(file.read_bytes())

@@ -1,4 +1,4 @@
-"""Stage 1 of ETL: explore, and condense the actions into synergies."""
+"""Stage 1 of ETL: explore, and extract synergies from the actions."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _OTHER_OPTIONS = ("unexpected keyword argument", "required keyword-only argument
 
 
 class Explorer:
-    """Stage 1: an exploration, a learner that is paid for it, and a synergy model beside it.
+    """Stage 1: an exploration, a learner that maximizes its reward, and a synergy model.
 
-    Every update draws one batch. Its bonus is that of the representation as it then is; the policy,
-    the representation and the synergy model learn from it side by side.
+    Each update trains the policy, the representation and the synergy model on one batch. The bonus
+    is computed with the current representation.
 
-    Deviates: after the last frame the synergy model is trained on for ``final_updates``; Algorithm
-    1 stops with the last frame (0).
+    Deviates: after the last frame the synergy model gets ``final_updates`` more updates; Algorithm
+    1 stops at the last frame (0).
 
     Attributes:
-        exploration (Exploration): see there.
-        model (SynergyModel): see there.
+        exploration (Exploration): the exploration method.
+        model (SynergyModel): the synergy model.
         stage (Stage): stage 1.
-        fitter (SACLearner): its learner, for steps on the synergy model alone.
+        fitter (SACLearner): updates the synergy model only, with the optimizer of stage 1.
     """
 
     def __init__(self, context: Context) -> None:
@@ -89,15 +89,15 @@ class Explorer:
         self.seed = self.stage.seed
 
     def _updates(self) -> dict[str, Any]:
-        """What of the stage's updates is other than its learner's."""
+        """Stage arguments that replace or defer updates if the exploration does not learn."""
         if self.exploration.learns:
             return {}
-        if self.term is None:  # the model is fitted when all actions are known
+        if self.term is None:  # the model is fitted once, on all actions
             return {"learning_starts": sys.maxsize}
         return {"updated": self.fitter}
 
     def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyDecoder]:
-        """Train the synergy model to the end; returns the decoder for stage 2.
+        """Finish the training of the synergy model; returns the decoder for stage 2.
 
         ``on_update`` is called before every few updates and may raise to stop.
         """
@@ -111,9 +111,9 @@ class Explorer:
         return self.model.decoder(self.actions())
 
     def actions(self, count: int = 20_000) -> torch.Tensor:
-        """Up to ``count`` of the latest actions that the synergy model is shown [N, n].
+        """Up to ``count`` of the latest actions, as the synergy model is trained on them [N, n].
 
-        Rows are relabelled and normalized, as in a batch.
+        Transitions are relabeled and normalized first, as in an update.
         """
         rows = self.stage.newest(count).to(self.stage.device)
         for transform in self.relabel:
@@ -121,8 +121,8 @@ class Explorer:
         return self.shown(self.fitter.objective.prepare(rows))["action"]
 
     def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
-        """All that was explored as stage 2 has it: the task's reward, and each executed action with
-        the coefficients that come nearest to it.
+        """All transitions of stage 1 for the buffer of stage 2, with the unscaled task reward and
+        with coefficients encoded from each executed action.
         """
         rows = self.stage.newest(self.stage.budget)
         kept = rows.select("observation", "action", ("next", "observation"))
@@ -132,13 +132,13 @@ class Explorer:
 
 
 def make_exploration(context: Context) -> Exploration:
-    """The exploration that the configuration names."""
+    """Build the exploration that the configuration names."""
     options = context.options("exploration")
     return _make("exploration", EXPLORATIONS, Exploration, (context.spec,), **options)
 
 
 def make_synergy_model(context: Context, num_synergies: int | None = None) -> SynergyModel:
-    """The synergy model that the configuration names, with its d or another."""
+    """Build the synergy model that the configuration names; ``num_synergies`` overrides its d."""
     options = context.options("synergies")
     options.pop("bundle", None)
     number = context.config.num_synergies if num_synergies is None else num_synergies
@@ -155,7 +155,7 @@ def _make(
     kind: str,
     **options: Any,
 ) -> T:
-    """One of ``kinds``, or of one's own, with the options of its section of the configuration."""
+    """Build one of ``kinds``, or a user's class, with the options of its section."""
     with naming(section):
         found = find_class(kind, kinds, base)
     try:

@@ -17,10 +17,10 @@ __all__ = ["Lattice"]
 
 
 class Lattice(Method):
-    """SAC with Lattice's actor, whose noise is its own.
+    """SAC with Lattice's actor, which has its own exploration noise.
 
-    Options: ``freq``, steps between draws of the noise matrices where they depend on the state,
-    and keyword arguments of :func:`~torchrl_etl.baselines.make_lattice_actor`.
+    Options: ``freq``, steps between draws of the noise matrices if they are state-dependent, and
+    keyword arguments of :func:`~torchrl_etl.baselines.make_lattice_actor`.
     """
 
     fixed = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
@@ -29,7 +29,7 @@ class Lattice(Method):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         self.actor_options = {k: v for k, v in self.options.items() if k != "freq"}
-        with naming("method.options"):  # each checks its own
+        with naming("method.options"):  # actor and behavior check their own arguments
             actor = make_lattice_actor(
                 {"observation": 1}, context.spec.action_spec, **self.actor_options
             )
@@ -39,7 +39,7 @@ class Lattice(Method):
         return {"kind": "lattice", **self.actor_options}
 
     def behavior(self, actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
-        """What collects: where the noise depends on the state, its matrices are held."""
+        """The behavior policy; state-dependent noise holds its matrices for ``freq`` steps."""
         if not self.options["state_dependent"]:
             return actor
         return LatticeNoise(actor, freq=self.options["freq"])

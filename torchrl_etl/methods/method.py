@@ -1,4 +1,4 @@
-"""What every method is to a run."""
+"""The interface between a method and a run."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ __all__ = ["Method"]
 
 
 class Method(ABC):
-    """What a run does before it learns the task, and with which learner it then does.
+    """Prepares a run, and builds the stage and the learner that learn its task.
 
     Args:
         context (Context): configuration, folder and environment of the run.
 
     Attributes:
-        charged (int): frames that :meth:`prepare` takes; they count.
-        has_synergies (bool): whether ``stage`` and ``synergies`` may be given.
-        takes (tuple of str): names of its own options.
-        fixed (tuple): settings that it can have in one way alone, each with that value and why.
+        charged (int): frames that :meth:`prepare` uses; they count toward the budget.
+        has_synergies (bool): whether ``stage`` and ``synergies`` may be set.
+        takes (tuple of str): names of the method's own options.
+        fixed (tuple): settings with only one valid value, each as (key, value, reason).
 
     Raises:
-        ValueError: for options that it does not have, or that cannot be used, and for settings
-            that it would not heed.
+        ValueError: for an unknown or invalid option, and for settings that the method ignores.
     """
 
     charged: int = 0
@@ -69,40 +68,40 @@ class Method(ABC):
             self.explores_nothing()
 
     def explores_nothing(self, bundle: str | None = None) -> None:
-        """Say so in the run's configuration: there is no stage 1 whose settings would hold."""
+        """Record in the run's configuration that it has no stage 1."""
         config = self.context.config
         config.exploration = {"kind": None}
         config.synergies = {"kind": None, "bundle": bundle}
         config.learn.prefill = False
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
-        """Find out what :meth:`stage` needs and leave it in the run folder.
+        """Compute what :meth:`stage` needs and save it in the run folder.
 
-        What is there already is not done again. Returns facts for ``summary.json``.
+        Results that exist already are reused. Returns facts for ``summary.json``.
         """
         yield from ()
         return {}
 
     @abstractmethod
     def stage(self) -> Stage:
-        """The stage that learns the task, before its first frame.
+        """Build the stage that learns the task.
 
-        Before :meth:`prepare` it has placeholders for what that finds.
+        Before :meth:`prepare`, placeholders stand in for its results.
         """
 
-    def begin(self, stage: Stage) -> None:  # noqa: B027 most have nothing to give
-        """Give the stage what it has before its first frame; a checkpoint replaces it."""
+    def begin(self, stage: Stage) -> None:  # noqa: B027 most need none
+        """Initialize the stage before its first frame; loading a checkpoint overrides this."""
 
     def actor(self) -> dict[str, Any]:
-        """The actor's kind, and arguments of its own, for :func:`~torchrl_etl.zoo.make_policy`."""
+        """The actor's kind and specific arguments for :func:`~torchrl_etl.zoo.make_policy`."""
         return {"kind": "gaussian"}
 
     def frames_before(self) -> int:
-        """Frames that :meth:`prepare` has taken, where it is done; else those that it will."""
+        """Frames that :meth:`prepare` has used, or will use if it has not run."""
         return self.charged
 
     def decoder(self) -> SynergyMap | None:
-        """What learning begins to act through, if that is known by now."""
+        """The decoder at the start of learning, if it is known already."""
         return None
 
     def explorer(self) -> Explorer | None:
@@ -110,13 +109,13 @@ class Method(ABC):
         return None
 
     def check(self) -> None:
-        """Build every part once, so that each objects to its arguments before the first frame."""
+        """Build every part once, so that invalid arguments raise before the first frame."""
         self.stage()
 
     def of_the_body(self, option: float | Mapping[str, float]) -> float:
-        """An option as given, or the one for this body of the two for ``legs`` and for ``hands``.
+        """An option's value; if it has one for ``legs`` and one for ``hands``, that for this body.
 
-        Legs are what stands free: a body whose root floats.
+        Bodies with a floating root count as legs.
         """
         if not isinstance(option, Mapping):
             return option

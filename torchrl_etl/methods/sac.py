@@ -1,4 +1,4 @@
-"""Plain SAC on all actuators: the control."""
+"""Plain SAC on all actuators: the control condition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SAR (Berg 2023): synergies from the muscle activity of a play, by PCA and ICA."""
+"""SAR (Berg 2023): synergies from muscle activity of a play phase, by PCA and ICA."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ __all__ = ["SAR"]
 
 
 class SAR(Method):
-    """Plays with plain SAC and takes synergies from the muscles of the best of fresh episodes.
+    """Trains a play policy with plain SAC, then extracts synergies from its best rollouts.
 
-    Deviates: the frames of the rollouts are charged too, so they are few; the first of them,
-    half at most, are the preview of whose returns the percentile is taken.
+    Deviates: frames of rollouts also count toward the budget, so rollouts are few; the first
+    episodes, at most half, are the preview from whose returns the percentile is computed.
 
-    The policy acts through the map as published, which ends at the bounds in a clamp. The bundle in
-    the run folder has the same components as ``synergies=sar`` has them
-    (:class:`~torchrl_etl.synergies.SARSynergies`), for the viewer and for ETL's stage 2; nothing in
-    this run reads it.
+    The policy acts through the published map, which clamps actions to the bounds. The run folder
+    also gets a bundle with the components of ``synergies=sar``
+    (:class:`~torchrl_etl.synergies.SARSynergies`), for the viewer and for ETL's stage 2. This run
+    does not read it.
 
-    Options: ``play_task`` (another task of the same body), ``frames`` of play and
-    ``rollout_frames`` after it, ``preview_episodes`` and ``percentile`` of their returns,
-    ``num_synergies`` and ``blend`` of :class:`~torchrl_etl.baselines.SARDecoder`.
+    Options: ``play_task`` (another task of the same body), ``frames`` of play, ``rollout_frames``
+    after play, ``preview_episodes`` and the ``percentile`` of their returns, ``num_synergies``, and
+    ``blend`` of :class:`~torchrl_etl.baselines.SARDecoder`.
     """
 
     takes = ("play_task", "frames", "rollout_frames", "preview_episodes", "percentile")
@@ -91,12 +91,12 @@ class SAR(Method):
             actions = self.best((yield from rollouts(play, self.rollout_frames, stop.check)))
             decoder = self.fit(actions)
             self._save_bundle(actions)
-            # Last, since it says that all of this is done.
+            # Written last, since its presence marks this step as complete.
             write_atomically(self.file, save(decoder.state_dict()))
         return {}
 
     def play_stage(self) -> Stage:
-        """The stage whose policy plays, before its first frame."""
+        """Build the play stage."""
         self.context.seed_everything("learn")
         return self.context.stage(
             self.context.learner(spec=self.play_spec),
@@ -107,7 +107,7 @@ class SAR(Method):
         )
 
     def best(self, rows: TensorDictBase) -> Tensor:
-        """Activations of the episodes above the percentile of the preview, the first of them."""
+        """Activations of episodes whose returns exceed the percentile of the preview episodes."""
         found = finished_episodes(rows)
         numbers = found["episodes"].unique()
         preview = numbers[: min(self.options["preview_episodes"], len(numbers) // 2)]
@@ -146,7 +146,7 @@ class SAR(Method):
         return decoder
 
     def _placeholder(self) -> SARDecoder:
-        """The decoder before play has said what it decodes to."""
+        """A decoder of the right sizes, for use before play."""
         spec = self.context.spec
         blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
         bounds = {"low": spec.low, "high": spec.high}
@@ -166,12 +166,12 @@ class SAR(Method):
 
 
 def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[TensorDictBase]:
-    """Steps [N] of new episodes of a stage's policy, acting as it explores, without learning.
+    """Collect transitions [N] of new episodes with a stage's behavior policy, without updates.
 
     Args:
-        stage (Stage): whose learner acts; it is closed.
-        frames (int): at least so many are collected.
-        check (callable): called before each batch; it may raise.
+        stage (Stage): stage whose behavior policy acts; closed afterwards.
+        frames (int): minimum number of frames.
+        check (callable): called before each batch; may raise to stop.
     """
     torch.manual_seed(stage.seed)  # the same whether or not the run was resumed
     kept = [("next", key) for key in ("activation", "episode_reward", "done")]
@@ -192,7 +192,7 @@ def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[Tenso
 
 
 def finished_episodes(rows: TensorDictBase) -> dict[str, Tensor]:
-    """Activations [N, n], returns [N] and episodes [N] of the steps of whole episodes."""
+    """Activations [N, n], returns [N] and episode indices [N] of all steps of whole episodes."""
     numbers, episode = rows["episode"].unique(return_inverse=True)
     ends = rows["next", "done"].reshape(-1)
     returns = torch.full(numbers.shape, torch.nan)

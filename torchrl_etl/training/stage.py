@@ -1,4 +1,4 @@
-"""A stage of a run: a collector fills a buffer, a learner draws batches from it."""
+"""A stage of a run: a collector fills a replay buffer, from which a learner samples batches."""
 
 from __future__ import annotations
 
@@ -38,15 +38,14 @@ TRANSITION = (
 
 
 AT_ONCE = {"cpu": 16, "cuda": 64}
-"""Batches that are read from the buffer in one go; more cost a CPU its caches, fewer leave a GPU
-waiting."""
+"""Batches to sample at once: more overflow the caches of a CPU, fewer leave a GPU idle."""
 
 
 class Progress:
-    """Counters of a stage, saved with it.
+    """Counters of a stage, saved in its checkpoints.
 
-    ``owed`` is the number of updates that the frames so far have earned but not yet had;
-    ``seconds`` is the wall time that the stage took, over all its starts.
+    ``owed`` is the number of updates that are due for the frames so far and have not been run;
+    ``seconds`` is the wall time of the stage, summed over resumes.
     """
 
     def __init__(self) -> None:
@@ -61,39 +60,38 @@ class Progress:
 
 
 class Stage:
-    """Collects with a learner's behavior policy and updates it as often as its frames have earned.
+    """Collects frames with a learner's behavior policy and updates it at a fixed replay ratio.
 
     Args:
-        name (str): of its logs and its checkpoints.
-        learner (SACLearner): what learns; its ``behavior`` collects.
-        make_env (callable): environment to collect from, transforms included.
+        name (str): name in logs and checkpoints.
+        learner (SACLearner): the learner; its ``behavior`` collects.
+        make_env (callable): builds the environment to collect from, transforms included.
 
     Keyword Args:
         frames (int): budget of the stage, in environment frames.
         seed (int): seed of the stage.
-        device (torch.device): where the buffer lives.
-        scratch (path): folder for the files of a ``"memmap"`` buffer; they are deleted when the
-            stage is closed.
+        device (torch.device): device of the buffer and of sampled batches.
+        scratch (path): folder for the files of a ``"memmap"`` buffer, deleted by :meth:`close`.
         collector (mapping): arguments of :func:`~torchrl_etl.collectors.make_batches`.
-        buffer_size (int): transitions to keep, 2 or more; never more than the budget are allocated.
-        buffer_storage (str): "memory" keeps them on the device, "memmap" in files.
-        batch_size (int): transitions in an update, 2 or more.
-        replay_ratio (float): updates per frame, up to 1,000.
+        buffer_size (int): capacity in transitions, 2 or more; the budget caps what is allocated.
+        buffer_storage (str): "memory" keeps transitions on the device, "memmap" in files.
+        batch_size (int): transitions per update, 2 or more.
+        replay_ratio (float): updates per frame, above 0 and up to 1,000.
         learning_starts (int): frames before the first update.
-        reward_scale (float): factor on the task's reward, before anything else reads it.
+        reward_scale (float): factor on the task's reward for learning; logged returns are unscaled.
         n_steps (int): rewards in a critic's target before it bootstraps, fewer at the end of an
             episode. Intermediate steps get no entropy bonus. Default: 1.
-        keep (sequence of NestedKey): further entries of a transition for the buffer.
-        transforms (sequence of Transform): what sampled rows, those of many updates at once, go
-            through; what depends on the updates before it is among the learner's ``transforms``.
-        updated (SACLearner, optional): what is updated. Default: ``learner``.
-        prefill_size (int): transitions to make room for beside the budget. Default: 0.
-        action_repeat (int): frames that a transition of the collector takes. Default: 1.
-        restart_seed (int): another one collects other episodes with the same ``seed``, so that a
-            run whose simulation diverges can go on from its checkpoint. Default: 0.
+        keep (sequence of NestedKey): additional entries of a transition to store.
+        transforms (sequence of Transform): applied to rows sampled for many updates at once;
+            transforms that depend on current weights belong to the learner instead.
+        updated (SACLearner, optional): learner to update. Default: ``learner``.
+        prefill_size (int): room for prefilled transitions, besides the budget. Default: 0.
+        action_repeat (int): frames per transition. Default: 1.
+        restart_seed (int): change it to collect other episodes with the same ``seed``, for example
+            to resume a run whose simulation diverged. Default: 0.
 
     Raises:
-        ValueError: naming the argument that cannot be used.
+        ValueError: if an argument is invalid; the message names it.
     """
 
     def __init__(
@@ -158,13 +156,13 @@ class Stage:
         return self.frames >= self.budget
 
     def ask(self) -> None:
-        """Let workers begin with the next batch, by the policy as it is."""
+        """Let workers start on the next batch with the current policy."""
         self.batches.ask()
 
     def collect(self) -> TensorDictBase:
-        """Collect one batch into the buffer; returns the whole batch, flat."""
+        """Collect one batch into the buffer; returns the batch, flattened."""
         batch = self.batches.next().to(self.device)
-        # One simulator has no dimension of its own, and several workers have one more.
+        # A single simulator adds no batch dimension; several workers add one more.
         batch = batch.reshape(-1, batch.shape[-1]).copy()
         batch["next", "reward"] = self.reward_scale * batch["next", "reward"]
         self.learner.observe(batch)
@@ -178,10 +176,10 @@ class Stage:
         return batch.reshape(-1)
 
     def learn(self) -> Work[TensorDictBase | None]:
-        """The updates that the collected frames have earned; returns their mean scalars.
+        """Run the updates that are due; returns the mean of their scalars.
 
-        The thousands that a prefilled buffer has earned are made up for in parts, see
-        :attr:`behind`.
+        A call runs at most twice the updates of one batch, so that the many updates due after a
+        prefill are spread over several calls; see :attr:`behind`.
         """
         due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
@@ -193,17 +191,17 @@ class Stage:
         return torch.cat(logs).mean(0) if logs else None
 
     def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[Due]:
-        """So many updates of a learner on sampled batches, a few at once, under this name."""
+        """Yield ``count`` updates on sampled batches, a few at a time, for the stage ``name``."""
         for few in parts(count, AT_ONCE[self.device.type]):
             yield Due(name, learner, learner.inputs(self.samples(few)))
 
     def samples(self, count: int) -> TensorDictBase:
-        """Batches [count, B] out of the buffer."""
+        """Sample batches [count, B] from the buffer."""
         rows = self.buffer.sample(count * self.batch_size).to(self.device)
         return rows.reshape(count, self.batch_size)
 
     def sample(self) -> TensorDictBase:
-        """A batch [B] out of the buffer."""
+        """Sample a batch [B] from the buffer."""
         return self.samples(1)[0]
 
     def update(self) -> TensorDictBase:
@@ -211,18 +209,18 @@ class Stage:
         return self.updated.update(self.sample())
 
     def earn(self, transitions: int) -> None:
-        """Owe the updates that the frames of so many transitions are worth."""
+        """Add the updates due for this many transitions."""
         self.progress.owed += self.action_repeat * transitions * self.replay_ratio
 
     @property
     def behind(self) -> bool:
-        """Whether :meth:`learn` left updates for later."""
+        """Whether :meth:`learn` still has updates to run."""
         return self.progress.owed >= 1
 
     def prefill(self, rows: TensorDictBase) -> None:
-        """Put transitions of another policy into the buffer; they earn updates like one's own.
+        """Add transitions of another policy to the buffer; they count toward the replay ratio.
 
-        Their reward is the task's, unscaled.
+        Their reward must be the task's, unscaled.
         """
         rows = rows.copy()
         rows["next", "reward"] = self.reward_scale * rows["next", "reward"]
@@ -236,15 +234,15 @@ class Stage:
     def newest(self, count: int) -> TensorDictBase:
         """Up to ``count`` of the latest transitions, oldest first."""
         rows, writer = self.buffer.storage[:], self.buffer.writer
-        if len(rows) == self.buffer.storage.max_size:  # full: the oldest row is the next to go
+        if len(rows) == self.buffer.storage.max_size:  # full: the oldest row is overwritten next
             rows = torch.cat([rows[writer._cursor :], rows[: writer._cursor]])
         return rows[-count:]
 
     def start_collection(self) -> None:
-        """Let workers start, if there are none; :meth:`restart_collection` waits for them."""
+        """Start workers if there are none; :meth:`restart_collection` waits for them."""
         if self.batches is None:
-            self._restart_policy()  # which workers copy as they start
-            # Only a run that begins or resumes builds a collector: that must not show.
+            self._restart_policy()  # workers copy the policy as they start
+            # An uninterrupted run builds no collector here, so a build must not advance the RNG.
             random = GlobalRNGState().state_dict()
             self.batches = self._make_batches(seed=self._collection_seed)
             GlobalRNGState().load_state_dict(random)
@@ -252,14 +250,14 @@ class Stage:
     def restart_collection(self) -> None:
         """Begin new episodes, seeded by the frame count.
 
-        A checkpoint cannot hold the inside of a simulator. Starting fresh episodes at every
-        checkpoint, in a run that goes on just as in one that was resumed, makes the two equal.
+        A checkpoint cannot store the state of a simulator. Every run therefore starts new episodes
+        at each checkpoint, so that a resumed run and an uninterrupted one give the same numbers.
         """
         self.start_collection()
         try:
             self.batches.await_start()
         except CollectionError:
-            self._close_batches()  # so that the next call starts others
+            self._close_batches()  # so that the next call starts new workers
             raise
         self._restart_policy()
         if self.multi_step is not None:
@@ -274,14 +272,14 @@ class Stage:
         return training_seed(self.seed, self.frames + 15_485_863 * self.restart_seed)
 
     def collect_from(self, **collector: Any) -> None:
-        """Collect by other arguments of :func:`~torchrl_etl.collectors.make_batches`, from the next
-        :meth:`restart_collection` on.
+        """Change arguments of :func:`~torchrl_etl.collectors.make_batches`, effective from the next
+        :meth:`restart_collection`.
         """
         self._close_batches()
         self._make_batches = partial(self._make_batches, **collector)
 
     def checkpoint(self) -> Checkpoint:
-        """Everything the stage needs to go on, as a TorchRL checkpoint."""
+        """Everything that a resume needs, as a TorchRL checkpoint."""
         parts = {**self.learner.parts, "progress": self.progress, "rng": GlobalRNGState()}
         parts["transforms"] = self.transforms
         return Checkpoint(**parts).register("buffer", self.buffer, adapter=BufferAdapter())
@@ -294,14 +292,13 @@ class Stage:
     def _close_batches(self) -> None:
         if self.batches is not None:
             self.batches.close()
-            # Simulators hold 100 MB each and sit in reference cycles: do not wait for the
-            # garbage collector to come by.
+            # Simulators take 100 MB each and sit in reference cycles, so collect garbage now.
             self.batches = None
             gc.collect()
 
 
 def check_budget(frames: int, replay_ratio: float) -> None:
-    """Refuse numbers of frames, and of updates per frame, that no stage can have.
+    """Raise a ``ValueError`` for an invalid frame budget or replay ratio.
 
     Examples:
         >>> check_budget(1000, 1e9)
@@ -314,7 +311,7 @@ def check_budget(frames: int, replay_ratio: float) -> None:
 
 
 def parts(total: int, most: int) -> list[int]:
-    """A number as a sum of numbers that are no larger than ``most``.
+    """Split ``total`` into parts of at most ``most``.
 
     Examples:
         >>> parts(40, 16)
@@ -324,7 +321,7 @@ def parts(total: int, most: int) -> list[int]:
 
 
 def frames_per_action(collector: Mapping[str, Any], action_repeat: int) -> int:
-    """Frames of a run for each action of one of its workers.
+    """Frames of a run per action of each worker.
 
     Examples:
         >>> frames_per_action({"kind": "process", "num_workers": 4}, action_repeat=2)
