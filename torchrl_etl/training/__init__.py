@@ -1,4 +1,4 @@
-"""What runs a learner: a stage, the loop around it, checkpoints, evaluation, queues of runs."""
+"""Training: a stage and its loop, checkpoints, evaluation, and queues of runs."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""How a checkpoint holds a replay buffer: its filled rows and where the next one goes."""
+"""Checkpoints of a replay buffer: its filled rows and the write position."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["BufferAdapter"]
 class BufferAdapter(CheckpointAdapter):
     """Saves the filled part of a buffer as memory maps.
 
-    TorchRL's own way (0.14.1) writes the storage at full capacity, refuses to load it into one of
-    another capacity (so no budget could be changed on resume), and pickles the prefetch queue.
+    TorchRL's own adapter (0.14.1) writes the storage at full capacity, cannot load it into another
+    capacity (so a resume could not change the budget), and pickles the prefetch queue.
     """
 
     adapter_id = "torchrl_etl.buffer"
@@ -38,6 +38,6 @@ class BufferAdapter(CheckpointAdapter):
             if position["rows"] == component.storage.max_size:  # full: the oldest row goes next
                 component.extend(rows)
                 component.writer._cursor = cursor % position["rows"]
-            else:  # of another size: the oldest first, and the newest if there is no room for all
+            else:  # other capacity: oldest rows first, only the newest if not all fit
                 rows = torch.cat([rows[cursor:], rows[:cursor]])
                 component.extend(rows[-component.storage.max_size :])

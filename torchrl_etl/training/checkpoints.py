@@ -1,4 +1,4 @@
-"""Checkpoints that survive a crash at any moment and say so when they did not."""
+"""Checkpoints that survive a crash at any time, with detection of damaged ones."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from torchrl_etl.io import flush_folder, require_room, write_atomically
 __all__ = ["Checkpoints"]
 
 _SEAL = "seal.json"
-_SMALL_FILES = 1_000_000  # bytes, generously, of the JSON beside the tensors
-# What TorchRL writes for tensors and plain values. Anything else (a pickle above all) could run
-# code when loaded, so it is refused before TorchRL sees it.
+_SMALL_FILES = 1_000_000  # bytes, an upper bound for the JSON besides the tensors
+# Suffixes that TorchRL writes for tensors and plain values. Other files, pickles above all, could
+# run code when loaded, so they are refused before TorchRL reads them.
 _PLAIN_FILES = {".json", ".memmap"}
 
 
 class Checkpoints(CheckpointRotation):
-    """TorchRL's checkpoint rotation, with a seal that proves a checkpoint whole.
+    """TorchRL's checkpoint rotation, with digests that show whether a checkpoint is complete.
 
     ``torchrl.checkpoint`` (0.14.1) publishes a folder by an atomic rename, but neither flushes
-    its files to disk nor notices a damaged one. Here every file is flushed and its SHA-256 goes
-    into ``seal.json``, before the folder gets its name: whatever has the name of a checkpoint was
-    whole once, and one whose seal is missing or does not match is passed over for the one before.
-    So that one is always whole, two or more are kept.
+    its files to disk nor detects damage. Here every file is flushed, and its SHA-256 is written to
+    ``seal.json``, before the folder is renamed. A folder with the name of a checkpoint was thus
+    complete once. If its seal is missing or does not match, the previous checkpoint is used. At
+    least two are kept, so that one is always complete.
     """
 
     def save(self, checkpoint: Checkpoint, *, step: int, **kwargs: Any) -> Path:
         """Save, flush and seal a checkpoint of frame ``step``; returns its folder."""
         self._remove_leftovers()
-        # TorchRL writes tensors through maps of sparse files, which a full disk makes deadly.
+        # TorchRL memory-maps sparse files; on a full disk, writing to one kills the process.
         require_room(self.directory, _size(checkpoint.components) + _SMALL_FILES)
         folder = self._checkpoint_path(step, "directory")
         fresh = folder.with_name(f".{folder.name}.stage-unsealed")
         try:
             checkpoint.save(fresh, **kwargs)
-        except RuntimeError as error:  # how PyTorch says that the disk is full
+        except RuntimeError as error:  # raised by PyTorch if the disk is full
             raise OSError(f"A checkpoint cannot be written to {self.directory}: {error}") from error
         write_atomically(fresh / _SEAL, json.dumps(_digests(fresh, flush=True), indent=1))
-        if folder.exists():  # a damaged one, which a resumed run passed over
+        if folder.exists():  # a damaged one that a resume has skipped
             self._remove_atomically(folder)
         os.replace(fresh, folder)
         flush_folder(self.directory)
@@ -56,12 +56,12 @@ class Checkpoints(CheckpointRotation):
         return folder
 
     def checkpoints(self) -> tuple[Path, ...]:
-        """All checkpoints by frame; TorchRL passes over those whose manifest is damaged."""
+        """All checkpoints by frame; TorchRL's version skips those with a damaged manifest."""
         named = self.directory.glob(f"{self.prefix}-*")
         return tuple(sorted(path for path in named if path.name.rpartition("-")[2].isdigit()))
 
     def newest_whole(self) -> Path | None:
-        """The newest checkpoint that is whole; a damaged newer one is named in a warning."""
+        """The newest undamaged checkpoint; warns about newer damaged ones."""
         for folder in reversed(self.checkpoints()):
             fault = _fault(folder)
             if fault is None:
@@ -73,11 +73,11 @@ class Checkpoints(CheckpointRotation):
         return None
 
     def load_newest_whole(self, checkpoint: Checkpoint) -> bool:
-        """Restore the newest whole checkpoint; False if none was ever finished.
+        """Restore the newest undamaged checkpoint; returns False if there are no checkpoints.
 
         Raises:
-            OSError: if there are checkpoints and none is whole (beginning anew in their place
-                would delete what is left of them), or if it is one of another configuration.
+            OSError: if all checkpoints are damaged (a fresh start would delete what is left of
+                them), or if the checkpoint was made with another configuration.
         """
         folder = self.newest_whole()
         if folder is not None:
@@ -96,14 +96,14 @@ class Checkpoints(CheckpointRotation):
         return folder is not None
 
     def _remove_leftovers(self) -> None:
-        """Delete the half-written folders of a process that was killed while saving."""
+        """Delete partially written folders of a process that was killed while saving."""
         for pattern in (".*.stage-*", ".*.delete-*", ".*.backup-*"):
             for leftover in self.directory.glob(pattern):
                 shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _size(value: Any) -> int:
-    """Bytes of all tensors below a component of a checkpoint."""
+    """Bytes of all tensors in a component of a checkpoint."""
     if isinstance(value, torch.Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, ReplayBuffer):

@@ -1,4 +1,4 @@
-"""What a configuration must satisfy that no part of a run checks for itself."""
+"""Checks of a configuration as a whole, and rules for resuming with changes."""
 
 from __future__ import annotations
 
@@ -69,19 +69,19 @@ RENAMED = {
     "learn.sac.noise": "learn.noise.kind",
     "learn.sac.hold": "learn.noise",
 }
-"""Settings by their names of before, and what they are called now."""
+"""Former names of settings, with their current names."""
 
 OPEN_SECTIONS = ("env_kwargs", "logger_kwargs", "ray", "distributed")
-"""Sections whose keys are arguments of another library's function."""
+"""Sections whose keys are passed on to another library."""
 
 PRESETS = {
     "learner": ("null", "residual"),
     "experiment": ("null", "laptop"),
     "faithful": ("null", "default"),
 }
-"""Groups of presets, with what stands for none of them, now and before."""
+"""Groups of presets, with the values that select none: the current and the former one."""
 
-_PLAIN = re.compile(r"[\w.-]*/[\w./-]*", re.ASCII)  # and no number, true, false or null
+_PLAIN = re.compile(r"[\w.-]*/[\w./-]*", re.ASCII)  # the slash rules out numbers, true and null
 
 _OF_A_STAGE = ("frames", "batch_size", "replay_ratio", "learning_starts")
 _OF_A_STAGE += ("buffer_size", "buffer_storage")
@@ -95,16 +95,16 @@ MAY_CHANGE = (
     *("learn.sac.lr", "learn.sac.lr_end", "learn.decoder.lr", "explore.sac.lr"),
     "explore.fit.final_updates",
 )
-"""Settings and sections that a resumed run may have otherwise than its checkpoints."""
+"""Settings and sections that may be changed when a run is resumed."""
 
 
 def validate(config: DictConfig) -> None:
-    """Check what concerns the run as a whole; the first fault raises one sentence.
+    """Check settings that concern the run as a whole.
 
-    What concerns a part is checked by its constructor, before the first frame.
+    Constructors check the settings of their own components, before the first frame.
 
     Raises:
-        ValueError: naming the key, what came and what is expected.
+        ValueError: for the first invalid setting, with its key, its value and what is expected.
     """
     for name in ("env", "run_dir", "device"):
         if not isinstance(config[name], str) or not config[name]:
@@ -153,13 +153,13 @@ def _check_values(config: DictConfig) -> None:
 
 
 def of_each_seed(config: DictConfig) -> list[DictConfig]:
-    """The configurations that ``seeds`` asks for, one a run; without it the one that is given.
+    """One configuration per entry of ``seeds``; the given configuration if ``seeds`` is null.
 
-    Each run has the folder that it would have by itself; where ``run_dir`` does not name the seed,
-    a folder below it does. One of them shows its progress.
+    Each run has the folder that it would have alone, or a subfolder ``seedN`` if ``run_dir`` does
+    not depend on the seed. Only the first shows its progress.
 
     Raises:
-        ValueError: if ``seeds`` is no list of different seeds.
+        ValueError: if ``seeds`` is not a list of distinct integers.
     """
     if config.seeds is None:
         return [config]
@@ -174,7 +174,7 @@ def of_each_seed(config: DictConfig) -> list[DictConfig]:
         own = config.copy()
         own.seeds, own.seed = None, seed
         own.progress = config.progress and seed == seeds[0]
-        own.run_dir = own.run_dir  # no ${now} any more, which is Hydra's and another one later
+        own.run_dir = own.run_dir  # resolves ${now}, which would change later
         configs.append(own)
     if len({own.run_dir for own in configs}) < len(configs):
         for own in configs:
@@ -183,23 +183,23 @@ def of_each_seed(config: DictConfig) -> list[DictConfig]:
 
 
 def quoted(value: str) -> str:
-    """A value of which Hydra reads nothing but the characters, in a list too.
+    """Quote a value so that Hydra reads it literally, also in a list.
 
     Examples:
         >>> from torchrl_etl.training.resumed import parse_override
         >>> parse_override(f"run_dir={quoted('runs/a, (new)')}").value()
         'runs/a, (new)'
     """
-    # Backslashes stand for themselves but before a quotation mark.
+    # Backslashes are literal except before a quotation mark.
     value = re.sub(r"(\\*)'", r"\1\1\\'", value)
     return "'" + re.sub(r"(\\+)$", r"\1\1", value) + "'"
 
 
 def to_go_on(folders: Sequence[Path]) -> str:
-    """The setting that goes on with the runs in these folders.
+    """The ``resume=`` setting that resumes the runs in these folders.
 
-    Hydra reads a name that is not plain only between quotation marks. A recipe puts them around a
-    single folder by itself, see :func:`~torchrl_etl.command_line.quote_paths`.
+    Hydra needs quotation marks around names with special characters. For a single folder, recipes
+    add them (:func:`~torchrl_etl.command_line.quote_paths`).
 
     Examples:
         >>> to_go_on([Path("runs/a"), Path("my runs/b")])
@@ -214,8 +214,8 @@ def to_go_on(folders: Sequence[Path]) -> str:
 
 
 def bfloat16_warning(config: DictConfig) -> str | None:
-    """What to say where bodies of that precision are asked for and the processor has no
-    instructions for it: PyTorch then emulates its products. ``None`` where all is well.
+    """A warning if bodies use bfloat16 on a CPU without instructions for it, where PyTorch emulates
+    its products; ``None`` otherwise.
     """
     sections = (config.explore, config.learn)
     bodies = {of.body for section in sections for of in (section.actor, section.critic)}
@@ -231,7 +231,7 @@ def bfloat16_warning(config: DictConfig) -> str | None:
 
 
 def _check_collector(collector: DictConfig) -> None:
-    # A batch comes from all workers, or from one of them.
+    # All workers contribute to a batch with "process"; else a batch comes from one worker.
     workers = collector.num_workers if collector.kind == "process" else 1
     if collector.frames_per_batch % (workers * collector.num_envs):
         raise ValueError(
@@ -259,7 +259,7 @@ def _check_loggers(names: object) -> None:
 
 
 def check_device(name: str) -> None:
-    """Raise a ``ValueError`` unless a run can be on this device."""
+    """Raise a ``ValueError`` unless this device is valid and available."""
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):

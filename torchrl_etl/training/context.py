@@ -1,4 +1,4 @@
-"""What a method is handed of the run that it is part of."""
+"""The context of a run, from which a method builds its learners and stages."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ NOT_OF_THE_STAGE += ("decoder", "prefill", "fit")  # the method's
 
 @dataclass(frozen=True)
 class Context:
-    """Configuration, folder and environment of a run, and how to build a stage for them.
+    """Configuration, folder and environment of a run; builds learners and stages for them.
 
     Args:
         config (DictConfig): see ``recipes/conf/config.yaml``.
-        folder (RunFolder): where the run leaves what it finds.
-        say (callable): where messages for a person go, one line each.
+        folder (RunFolder): the run's folder for results.
+        say (callable): called with each message for the user, one line each.
     """
 
     config: DictConfig
@@ -73,7 +73,7 @@ class Context:
 
     @property
     def task_options(self) -> dict[str, Any]:
-        """Those besides the name."""
+        """Arguments of :attr:`task` other than the name."""
         return {
             "goal": self.config.goal,
             "action_repeat": self.config.action_repeat,
@@ -84,20 +84,20 @@ class Context:
     def learner(
         self, section: str = "learn", *, spec: EnvironmentSpec | None = None, **parts: Any
     ) -> SACLearner:
-        """The learner that ``section`` configures.
+        """Build the learner that ``section`` configures.
 
         Args:
             section (str): ``"explore"`` or ``"learn"``.
 
         Keyword Args:
-            spec (EnvironmentSpec, optional): of another environment than the run's.
+            spec (EnvironmentSpec, optional): environment to learn in. Default: the run's.
             **parts: see :func:`~torchrl_etl.learners.build_learner`.
         """
         spec = spec or self.spec
         options = self.options(section)
         configured = {key: options[key] for key in ("actor", "critic", "sac", "noise")}
         compile = self.config.compile
-        if compile is None:  # what it takes to begin must pay
+        if compile is None:  # compile only if the run is long enough to save time
             with naming(section):
                 check_budget(options["frames"], options["replay_ratio"])
             compile = options["frames"] * options["replay_ratio"] >= 4_000
@@ -119,18 +119,18 @@ class Context:
         env_transforms: Sequence[Transform] = (),
         **options: Any,
     ) -> Stage:
-        """The stage that ``section`` configures, before its first frame.
+        """Build the stage that ``section`` configures.
 
         Args:
-            learner (SACLearner): what learns in it.
+            learner (SACLearner): the learner of the stage.
             section (str): ``"explore"`` or ``"learn"``.
 
         Keyword Args:
-            task (str, optional): another task than the run's, with the goal that its name says.
-            env_options (dict): what the environment must also give, see
-                :func:`~torchrl_etl.envs.make_env`.
-            env_transforms (sequence of Transform): appended to it.
-            **options: in place of configured arguments of :class:`~torchrl_etl.training.Stage`.
+            task (str, optional): task in place of the run's, with the goal implied by its name.
+            env_options (dict): additional arguments of :func:`~torchrl_etl.envs.make_env`, such as
+                ``muscle_lengths=True``.
+            env_transforms (sequence of Transform): transforms to append to the environment.
+            **options: override configured arguments of :class:`~torchrl_etl.training.Stage`.
         """
         collector = self.options("collector")
         num_envs = collector.pop("num_envs")
@@ -144,7 +144,7 @@ class Context:
         fast = num_envs > 1 and not slow
         collector["collector_class"] = VectorCollector if fast else Collector
         collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
-        other = {"goal": None, "success_key": None} if task else {}  # what it says itself
+        other = {"goal": None, "success_key": None} if task else {}  # implied by the task
         make_env = partial(
             env_of_a_collector,
             task or self.config.env,
@@ -168,7 +168,7 @@ class Context:
             return Stage(learner=learner, make_env=make_env, **{**configured, **fixed, **options})
 
     def actions(self, frames: int) -> int:
-        """Actions of each worker, all its simulators counted, in so many frames of the run."""
+        """Actions of each worker, over all its simulators, in this many frames of the run."""
         return frames // frames_per_action(self.options("collector"), self.config.action_repeat)
 
     def run_stage(
@@ -189,12 +189,12 @@ class Context:
 
 
 def stage_seed(seed: int, section: str) -> int:
-    """Seeds of the two stages never meet."""
+    """Seed of a stage: even for ``"explore"``, odd for ``"learn"``."""
     return 2 * seed + (section != "explore")
 
 
 def env_of_a_collector(name: str, transforms: Sequence[Transform], **kwargs: Any) -> TransformedEnv:
-    """Simulators with what the loop logs and what a stage needs; sent to workers as it is."""
+    """Build simulators with the transforms that loop and stage need; picklable for workers."""
     own = [transform.clone() for transform in transforms]
     return TransformedEnv(
         make_env(name, **kwargs, device="cpu"), Compose(RewardSum(), InitTracker(), *own)

@@ -1,4 +1,4 @@
-"""Targets of several steps that do not end with a collector's batch."""
+"""n-step targets that continue across collector batches."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ __all__ = ["ContinuedMultiStep"]
 
 
 class ContinuedMultiStep(MultiStep):
-    """TorchRL's ``MultiStep`` that waits for the next batch where this one ends too early.
+    """TorchRL's ``MultiStep``, except that incomplete transitions wait for the next batch.
 
-    Each transition is made to span ``n_steps`` steps, or those to the end of its episode: its
-    reward is their discounted sum, and what follows it, flags included, is what follows the last
-    of them. The last ``n_steps - 1`` of a batch come out with the next batch, if that one goes on
-    where this one ended; otherwise (it is another worker's, say) they come out with fewer steps.
+    Each transition spans ``n_steps`` steps, or fewer at the end of its episode. Its reward is their
+    discounted sum, and its next observation and flags are those of the last step. The last
+    ``n_steps - 1`` transitions of a batch are returned with the next batch if that continues this
+    one. Otherwise (if it comes from another worker, for example) they get fewer steps.
 
-    :class:`~torchrl.envs.MultiStepTransform` waits too, but takes it for granted that batches go
-    on from each other.
+    :class:`~torchrl.envs.MultiStepTransform` waits too, but assumes that each batch continues the
+    one before.
 
     Args:
         gamma (float): discount factor.
-        n_steps (int): most steps of a transition.
+        n_steps (int): maximum number of steps of a transition.
 
     Keys:
         those of :class:`torchrl.data.postprocs.MultiStep`; the input is a batch [simulators, time]
@@ -48,12 +48,12 @@ class ContinuedMultiStep(MultiStep):
 
     def __init__(self, gamma: float, n_steps: int) -> None:
         super().__init__(gamma, n_steps)
-        # TorchRL 0.14.1 leaves these at the first step, and bootstraps past an end.
+        # TorchRL 0.14.1 takes these from the first step and so bootstraps past an end.
         self.done_keys = ()
         self._waiting: TensorDictBase | None = None
 
     def forget(self) -> None:
-        """What waits is dropped: episodes begin anew."""
+        """Drop waiting transitions, as episodes restart."""
         self._waiting = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -71,7 +71,7 @@ class ContinuedMultiStep(MultiStep):
 
 
 def _goes_on(before: TensorDictBase, batch: TensorDictBase) -> bool:
-    """Whether a batch begins with what every simulator saw last, or after the end of an episode."""
+    """Whether every simulator continues the batch before, or starts a new episode."""
     if len(before) != len(batch):
         return False
     seen, sees = before[:, -1]["next"], batch["observation"][:, 0]

@@ -30,7 +30,7 @@ EVALUATION_SEED = 10_000_000
 class Evaluation(NamedTuple):
     """Episodes of one policy: undiscounted returns [E], lengths [E], solved steps [E] or None.
 
-    ``time_limit`` is the length of a full episode; ``successes`` [E] says which of them count as
+    ``time_limit`` is the length of a full episode. ``successes`` [E] tells which episodes count as
     solved, or is None.
     """
 
@@ -48,8 +48,8 @@ class Evaluation(NamedTuple):
     def solved(self) -> Interval | None:
         """Share of episodes that count as solved.
 
-        On its walking tasks a step is "solved" while the speed is near the target, as it also is
-        in falling forward; read :attr:`solved_time` there.
+        Walking tasks flag a step as "solved" while the speed is near the target, which includes
+        falling forward; use :attr:`solved_time` there.
         """
         return None if self.successes is None else success_interval(self.successes)
 
@@ -61,12 +61,12 @@ class Evaluation(NamedTuple):
         return interval([steps / self.time_limit for steps in self.solved_steps])
 
     def intervals(self) -> dict[str, Interval]:
-        """By name, those that the environment defines."""
+        """The intervals that the environment defines, by name."""
         named = {"return": self.mean_return, "solved": self.solved, "solved_time": self.solved_time}
         return {name: value for name, value in named.items() if value is not None}
 
     def summary(self) -> dict[str, object]:
-        """JSON-able: intervals, and every episode's own numbers."""
+        """Intervals and the numbers of each episode, JSON-serializable."""
         intervals = {name: value._asdict() for name, value in self.intervals().items()}
         return {**intervals, "episodes": self._asdict(), "first_seed": EVALUATION_SEED}
 
@@ -83,7 +83,7 @@ def evaluate(
 ) -> Evaluation:
     """Run the deterministic policy for one episode per evaluation seed.
 
-    Training's random numbers are left as they were, so evaluating more often changes nothing.
+    The RNG state of training is preserved, so the number of evaluations does not affect it.
 
     Args:
         policy (TensorDictModuleBase): the policy.
@@ -91,11 +91,10 @@ def evaluate(
 
     Keyword Args:
         episodes (int): number of episodes; episode i is seeded with ``seed + i``.
-        max_steps (int): where to cut an episode that the environment does not end, in simulator
-            steps, as are the lengths.
-        action_repeat (int): simulator steps that a step of the environment takes.
-        solved_steps (int, optional): on how many steps an episode must be solved to count, such as
-            :attr:`Task.solved_steps <torchrl_etl.envs.Task>`. Default: on its last.
+        max_steps (int): limit of an episode in simulator steps, the unit of the lengths.
+        action_repeat (int): simulator steps per step of the environment.
+        solved_steps (int, optional): number of solved steps that make an episode a success, such
+            as :attr:`Task.solved_steps <torchrl_etl.envs.Task>`. Default: the last step must be.
         seed (int): first seed.
     """
     returns, lengths, solved, successes = [], [], [], []
@@ -116,7 +115,7 @@ def evaluate(
 
 @contextmanager
 def as_evaluated(env: EnvBase) -> Iterator[None]:
-    """A policy acts without noise, and training finds its random numbers as they were."""
+    """Context for deterministic actions without gradients; restores the RNG state on exit."""
     devices = [env.device] if env.device is not None and env.device.type == "cuda" else []
     with (
         torch.random.fork_rng(devices),
@@ -129,13 +128,13 @@ def as_evaluated(env: EnvBase) -> Iterator[None]:
 def evaluate_task(
     policy: TensorDictModuleBase, env: EnvBase, task: Mapping[str, Any], *, episodes: int
 ) -> Evaluation:
-    """Evaluate a policy on a task as every run does: its episodes' length, its idea of success.
+    """Evaluate a policy as every run does, with the task's episode length and success criterion.
 
     Args:
         policy (TensorDictModuleBase): the policy.
         env (EnvBase): the task's environment.
-        task (mapping): what it was built with: ``name``, ``goal``, ``action_repeat`` and
-            ``env_kwargs`` of :func:`~torchrl_etl.envs.make_env`.
+        task (mapping): arguments of :func:`~torchrl_etl.envs.make_env` that built it: ``name``,
+            ``goal``, ``action_repeat`` and ``env_kwargs``.
 
     Keyword Args:
         episodes (int): number of episodes.
@@ -157,7 +156,7 @@ def evaluate_task(
 
 
 def longest_episode(task: Mapping[str, Any]) -> int:
-    """Steps of the simulator after which an episode ends; 1,000 where the task does not say.
+    """Time limit of an episode in simulator steps; 1,000 if the task has none.
 
     Examples:
         >>> longest_episode({"name": "overactuated"})

@@ -1,4 +1,4 @@
-"""The loop of a stage: collect, update, log, evaluate, save; stop cleanly when asked."""
+"""The loop of a stage: collect, update, log, evaluate, save; stop cleanly on a signal."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ __all__ = ["Interrupted", "StopOnSignal", "run_stage"]
 
 
 class Interrupted(KeyboardInterrupt):
-    """The run was asked to stop; everything up to now is saved."""
+    """The run was asked to stop and has saved its state."""
 
 
 class StopOnSignal(AbstractContextManager):
     """Turns the first stop signal into a request to stop at the next safe point.
 
-    Stop signals are Ctrl-C, SIGTERM, SIGUSR1 (what Slurm is told to send before the time is up)
-    and SIGHUP (a closed terminal; ``nohup`` still means to live on). A second one ends the process
-    at once.
+    Stop signals are Ctrl-C, SIGTERM, SIGUSR1 (which Slurm can send before the time limit) and
+    SIGHUP (a closed terminal; ignored under ``nohup``). A second signal ends the process at once.
     """
 
     def __init__(self) -> None:
@@ -60,7 +59,7 @@ class StopOnSignal(AbstractContextManager):
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:
-            # Not an exception, which could surface anywhere: the signal does what it always did.
+            # Restore the default action rather than raise, which could interrupt any code.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         self.requested = True
@@ -79,25 +78,25 @@ def run_stage(
     offset: int = 0,
     show_progress: bool = True,
 ) -> Work[Evaluation | None]:
-    """Run a stage to the end of its budget, going on from its newest whole checkpoint.
+    """Run a stage to the end of its budget, resuming from its newest undamaged checkpoint.
 
     Every checkpoint starts new episodes (see :meth:`Stage.restart_collection`), so a run that was
-    killed and resumed draws the same numbers as one that was not.
+    killed and resumed gives the same numbers as an uninterrupted one.
 
     Args:
-        stage (Stage): what to run.
-        folder (RunFolder): where metrics and checkpoints go.
-        stop (StopOnSignal): asked after every batch.
+        stage (Stage): the stage to run.
+        folder (RunFolder): folder for metrics and checkpoints.
+        stop (StopOnSignal): checked after every batch.
 
     Keyword Args:
-        evaluate (callable, optional): evaluates the present policy.
-        evaluate_every, checkpoint_every, log_every (int): in frames of this stage.
+        evaluate (callable, optional): evaluates the current policy.
+        evaluate_every, checkpoint_every, log_every (int): intervals in frames of this stage.
         keep (int): checkpoints to keep.
-        offset (int): frames charged before this stage.
+        offset (int): frames used before this stage, added to logged frame counts.
         show_progress (bool): draw a progress bar.
 
     Returns:
-        Evaluation, optional: the one after the last frame, if it was made now.
+        Evaluation, optional: the evaluation after the last frame, if this call made it.
 
     Raises:
         Interrupted: after saving, if a stop was requested.
@@ -106,7 +105,7 @@ def run_stage(
     resumed = checkpoints.load_newest_whole(stage.checkpoint())
     if not resumed:
         _refuse_lost_checkpoints(stage, folder)
-    # A fresh start also forgets the row of frame 0 that a run killed before saving may have left.
+    # A fresh start also drops the row of frame 0 from a run that was killed before saving.
     folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
     if stage.finished:
         return None
@@ -118,12 +117,12 @@ def run_stage(
         if not resumed and evaluate is not None:
             report.evaluation(evaluate())
         stage.start_collection()
-        yield  # the workers of other seeds start meanwhile
+        yield  # workers of other seeds start meanwhile
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames
             stage.ask()
-            yield  # the others ask, too, before this one waits
+            yield  # other seeds request their batches before this one waits
             report.batch(stage.collect(), (yield from stage.learn()))
             while stage.behind and not stop.requested:
                 yield from stage.learn()
@@ -148,7 +147,7 @@ def run_stage(
 
 
 def _refuse_lost_checkpoints(stage: Stage, folder: RunFolder) -> None:
-    """Keep the rows of a stage that was saved once and has no checkpoint any more."""
+    """Raise rather than overwrite the logs of a stage whose checkpoints are missing."""
     if stage.name in (saved := folder.saved):
         raise OSError(
             f"{folder.path} was saved at frame {saved[stage.name]} of stage {stage.name!r} and "
@@ -171,7 +170,7 @@ def _progress_bar(stage: Stage, show: bool) -> tqdm:
 
 
 class _Report:
-    """Means over the window since the last row, for the logs and the progress bar."""
+    """Logs means over the window since the last row, and updates the progress bar."""
 
     def __init__(self, stage: Stage, folder: RunFolder, bar: tqdm, offset: int) -> None:
         self.stage, self.folder, self.bar, self.offset = stage, folder, bar, offset
@@ -180,7 +179,7 @@ class _Report:
         self.forget_open_window()
 
     def forget_open_window(self) -> None:
-        """Start a new window; checkpoints do, so that a resumed run logs the same means."""
+        """Start a new window. Checkpoints do, so that a resumed run logs the same means."""
         self.returns: list[float] = []
         self.solved: list[float] = []
         self.losses: list[TensorDictBase] = []

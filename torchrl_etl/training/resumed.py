@@ -1,4 +1,4 @@
-"""The configuration that a run goes on with: its own, and what is asked for now."""
+"""The configuration of a resumed run: its stored settings plus new overrides."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ with extra("recipes"):
 
 __all__ = ["check_prefix", "parse_override", "resumed_config"]
 
-# Every release had these, and the last of them ends the file: one that was cut short lacks it.
+# Every release has these sections, and the file ends with the last: a truncated file lacks it.
 _SECTIONS = ("explore", "learn", "checkpoint", "collector", "method")
-# Sections whose options are those of the kind that they name.
+# Sections whose options depend on their ``kind``.
 _OF_A_KIND = ("exploration", "synergies")
 
 
 def resumed_config(
     folder: Path, overrides: Sequence[str] = (), *, defaults: DictConfig | None = None
 ) -> DictConfig:
-    """The configuration of an earlier run, with the overrides given now on top.
+    """The configuration of an earlier run with new overrides.
 
     Args:
         folder (path): the run folder.
-        overrides (sequence of str): in Hydra's form.
+        overrides (sequence of str): overrides in Hydra's syntax.
 
     Keyword Args:
-        defaults (DictConfig, optional): what settings are taken from that the run's release did
-            not have yet; a warning names them.
+        defaults (DictConfig, optional): values of settings that the run's release did not have; a
+            warning names them.
 
     Raises:
         ValueError: if the folder holds no run, its configuration is damaged, or an override is
-            unknown or would make it another run.
+            unknown or not allowed in a resume.
     """
     config = _stored(Path(folder) / "config.yaml")
     newer = {} if defaults is None else dict(_missing(config, defaults))
@@ -55,7 +55,7 @@ def resumed_config(
     keys = {override.key_or_group for override in parsed}
     if {"frames", "learn.frames"} <= keys:
         raise ValueError("frames and learn.frames were given, and each sets the budget; give one.")
-    if "learn.frames" in keys:  # the newer of the two settings counts
+    if "learn.frames" in keys:  # the setting given now takes precedence
         config.frames = None
     if taken := [f"{key}={value}" for key, value in newer.items() if key not in keys]:
         warnings.warn(
@@ -67,10 +67,10 @@ def resumed_config(
 
 
 def parse_override(override: str) -> Override:
-    """What Hydra reads in an argument.
+    """Parse an argument as Hydra does.
 
     Raises:
-        ValueError: in one sentence, if it cannot be read.
+        ValueError: if the argument is invalid, with a one-sentence message.
     """
     try:
         return OverridesParser.create().parse_override(override)
@@ -80,10 +80,10 @@ def parse_override(override: str) -> Override:
 
 
 def check_prefix(override: Override, known: bool) -> None:
-    """Refuse to take settings away, and to add one that is there already.
+    """Check the prefix of an override.
 
     Raises:
-        ValueError: if the override would.
+        ValueError: if the override deletes a setting, or adds one that exists.
     """
     key = override.key_or_group
     if override.is_delete():
@@ -107,7 +107,7 @@ def _stored(path: Path) -> DictConfig:
         raise ValueError(
             f"{path} is damaged ({fault}); copy it from a backup of the run, or start a new run."
         )
-    if "learner" in config.method:  # nothing but its name has changed
+    if "learner" in config.method:  # only the name has changed
         config.method.kind = config.method.pop("learner")
     if old := [key for key in RENAMED if OmegaConf.select(config, key) is not None]:
         raise ValueError(
@@ -118,7 +118,7 @@ def _stored(path: Path) -> DictConfig:
 
 
 def _lacks(config: Any) -> str | None:
-    """What every configuration of a run has and this one does not."""
+    """What this configuration lacks that every run's has, or ``None``."""
     if not isinstance(config, DictConfig):
         return "it holds no settings"
     plain = OmegaConf.to_container(config)
@@ -128,14 +128,14 @@ def _lacks(config: Any) -> str | None:
 
 
 def _missing(config: DictConfig, defaults: DictConfig) -> Iterator[tuple[str, Any]]:
-    """Settings that only ``defaults`` has, whole sections as one, with their values."""
+    """Settings that only ``defaults`` has, with their values; a missing section is one entry."""
 
     def walk(have: Any, want: Any, prefix: str) -> Iterator[tuple[str, Any]]:
         for key, value in want.items():
             if key not in have:
                 yield f"{prefix}{key}", value
             elif prefix + key in _OF_A_KIND and have[key].get("kind") != value.get("kind"):
-                continue  # another kind's options are none of it
+                continue  # options of another kind do not apply
             elif isinstance(value, dict) and isinstance(have[key], dict):
                 yield from walk(have[key], value, f"{prefix}{key}.")
 
@@ -143,7 +143,7 @@ def _missing(config: DictConfig, defaults: DictConfig) -> Iterator[tuple[str, An
 
 
 def _override(config: DictConfig, override: Override, newer: Container[str]) -> None:
-    """Set what an override asks for."""
+    """Apply an override if it is valid and allowed in a resume."""
     key = override.key_or_group
     section, _, name = key.rpartition(".")
     parent = OmegaConf.select(config, section) if section else config

@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: configuration, versions, metrics, checkpoints, pictures."""
+"""The folder of a run: configuration, versions, metrics, checkpoints and figures."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _PACKAGES = (
 
 
 class RunFolder:
-    """Paths of a run and the writers of its small files; :meth:`open` is the first to write.
+    """Paths and small files of a run; nothing is written before :meth:`open`.
 
-    The configuration's ``log`` names the loggers. Where another run was quicker to take the name of
-    the folder, ``unique`` lets a number be added to it.
+    The configuration's ``log`` names the loggers. With ``unique``, a number is added to the name of
+    the folder if it is taken.
     """
 
     def __init__(self, path: Path, config: DictConfig, *, unique: bool = False) -> None:
@@ -43,7 +43,7 @@ class RunFolder:
         self._config, self._loggers, self._purge_step = config, None, None
 
     def open(self, *, resume: bool) -> None:
-        """Make the folder and write the configuration and the versions into it.
+        """Create the folder and write the configuration and the versions to it.
 
         Raises:
             FileExistsError: if the folder already holds a run and ``resume`` is False.
@@ -58,7 +58,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock = FileLock(self.path / ".lock", is_singleton=True)
             self._lock.acquire(timeout=0)
-            # Asked only now: of two runs that begin together, one may have been through already.
+            # Checked under the lock: another run may have started and finished meanwhile.
             if (self.path / "config.yaml").exists() and not resume:
                 self._lock.release()
                 raise _HoldsARun(
@@ -77,11 +77,11 @@ class RunFolder:
                 f"The run folder {self.path} cannot be written ({error.strerror}); choose another "
                 "run_dir or mend its permissions."
             ) from error
-        # One entry a start: a run may be resumed on another machine or commit.
+        # One entry per start: a run may be resumed on another machine or commit.
         self.write_json("versions.json", [*self.versions, facts()])
 
     def close(self) -> None:
-        """Let other processes have the folder."""
+        """Release the lock on the folder."""
         self._lock.release()
 
     @staticmethod
@@ -105,16 +105,16 @@ class RunFolder:
 
     @property
     def versions(self) -> list[dict[str, Any]]:
-        """What :func:`facts` gave at each start."""
+        """The :func:`facts` of each start."""
         return self._read_json("versions.json", [])
 
     @property
     def saved(self) -> dict[str, int]:
-        """Frames of each stage at its last checkpoint, known also where that is gone since."""
+        """Frames of each stage at its last checkpoint, even if the checkpoint was deleted."""
         return self._read_json("saved.json", {})
 
     def remember_saved(self, stage: str, frames: int) -> None:
-        """Note that ``stage`` has a checkpoint, for :attr:`saved`."""
+        """Record in :attr:`saved` that ``stage`` has a checkpoint."""
         self.write_json("saved.json", {**self.saved, stage: frames})
 
     @property
@@ -136,7 +136,7 @@ class RunFolder:
         return self.path / "csv" / "scalars"
 
     def forget_after(self, stage: str, frame: int) -> None:
-        """Drop the rows of ``stage`` later than ``frame``, which a resumed run will write again."""
+        """Drop rows of ``stage`` after ``frame``, which a resumed run logs again."""
         for path in sorted((self.scalars / stage).rglob("*.csv")):
             rows = (f"{at},{value}\n" for at, value in _read(path) if at <= frame)
             write_atomically(path, "".join(rows))
@@ -144,9 +144,9 @@ class RunFolder:
             self._purge_step = frame + 1
 
     def log(self, values: Mapping[str, float], frame: int) -> None:
-        """Log scalars at a frame count that charges both stages."""
+        """Log scalars at a frame count that includes earlier stages."""
         if self._loggers is None:
-            # The summary and the learning curves are read back from the CSV files.
+            # Summary and learning curves read the CSV files.
             names = dict.fromkeys(("csv", *self._config.log))
             self._loggers = [self._logger(name) for name in names]
         for logger in self._loggers:
@@ -154,7 +154,7 @@ class RunFolder:
                 logger.log_scalar(key, float(value), step=frame)
 
     def series(self, key: str) -> tuple[list[int], list[float]]:
-        """Frames and values that the CSV logger kept under ``key``."""
+        """Frames and values of ``key`` in the CSV log."""
         path = self.scalars / f"{key}.csv"
         rows = _read(path) if path.exists() else []
         return [frame for frame, _ in rows], [value for _, value in rows]
@@ -172,20 +172,20 @@ class RunFolder:
         return get_logger(name, str(self.path), title, **{f"{name}_kwargs": options})
 
     def _own(self, name: str) -> dict[str, Any]:
-        """What tells this run from others in a logger's own list of them."""
-        if name == "mlflow":  # has a store of its own in every run folder
+        """Arguments by which a logger identifies this run."""
+        if name == "mlflow":  # has its own store in every run folder
             return {}
         from omegaconf import OmegaConf
 
         config = OmegaConf.to_container(self._config, resolve=True)
-        if name == "trackio":  # knows a run again by its name
+        if name == "trackio":  # identifies a run by its name
             return {"config": config}
         if not (known := self._read_json("wandb.json", {})):
             self.write_json("wandb.json", known := {"id": uuid.uuid4().hex})
         return {"config": config, "id": known["id"]}
 
     def _read_json(self, name: str, default: Any) -> Any:
-        """What :meth:`write_json` wrote; a value of the same type as ``default``, if none."""
+        """Content written by :meth:`write_json`, of the type of ``default``, else ``default``."""
         path = self.path / name
         if not path.exists():
             return default
@@ -193,7 +193,7 @@ class RunFolder:
 
 
 def _claimed(path: Path) -> Path:
-    """A folder of this name, or with a number after it, that nobody else has."""
+    """Create a folder of this name, with a number appended if it exists."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     for candidate in itertools.chain([path], numbered):
         try:
@@ -205,11 +205,11 @@ def _claimed(path: Path) -> Path:
 
 
 class _HoldsARun(FileExistsError):
-    """Not one of the faults that make a folder unwritable."""
+    """Distinguishes a folder that holds a run from one that cannot be written."""
 
 
 class _ResumableTensorboard(TensorboardLogger):
-    """TorchRL's logger (0.14.1) has no way to hide what a killed run wrote past its checkpoint."""
+    """TorchRL's logger plus ``purge_step`` (missing in 0.14.1), to hide rows past a checkpoint."""
 
     def __init__(self, log_dir: str, purge_step: int | None) -> None:
         self._purge_step = purge_step
@@ -222,9 +222,9 @@ class _ResumableTensorboard(TensorboardLogger):
 
 
 def facts() -> dict[str, Any]:
-    """Versions, commit and machine class: what a number must carry to be believed."""
+    """Versions, commit and type of machine, for reproducibility."""
     found = {"commit": _commit(), "python": platform.python_version()}
-    for name in _PACKAGES:  # the first too, in a checkout that nobody installed
+    for name in _PACKAGES:  # even torchrl_etl may not be installed, in a checkout
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
@@ -241,7 +241,7 @@ def _commit() -> str | None:
 
 
 def _read(path: Path) -> list[tuple[int, float]]:
-    """Whole rows of a scalar file; the one that is being written, or was at a crash, is not."""
+    """Complete rows of a scalar file; skips a last row that is not fully written."""
     try:
         whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
         rows = [line.split(",") for line in whole.splitlines()]

@@ -1,4 +1,4 @@
-"""Where the transitions of a replay buffer are kept."""
+"""Storage of a replay buffer."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ __all__ = ["make_storage"]
 
 
 def make_storage(size: int, device: torch.device, scratch: Path | None) -> Storage:
-    """Room for ``size`` transitions, taken when the first one comes; in files with ``scratch``."""
+    """Storage for ``size`` transitions, allocated on first use; in files if ``scratch`` is set."""
     if scratch is None:
         return LazyTensorStorage(size, device=device)
-    # Without a folder TorchRL 0.14.1 maps shared memory, which is memory all the same.
+    # Without a folder, TorchRL 0.14.1 maps shared memory, which still occupies RAM.
     return ReservedMemmapStorage(size, scratch_dir=scratch, existsok=True)
 
 
 class ReservedMemmapStorage(LazyMemmapStorage):
-    """TorchRL's storage maps sparse files: a full disk would kill the run later, without a word."""
+    """Reserves disk space at once: TorchRL maps sparse files, so a full disk would kill the run."""
 
     def _init(self, data: Any) -> None:
         try:
             super()._init(data)
-        except RuntimeError as error:  # how PyTorch says that a file cannot be so large
+        except RuntimeError as error:  # raised by PyTorch if a file cannot be this large
             raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
         for file in Path(self.scratch_dir).rglob("*.memmap"):
             reserve(file)

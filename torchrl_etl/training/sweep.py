@@ -1,4 +1,4 @@
-"""A queue of runs that can be killed at any time and started again."""
+"""A queue of runs that can be killed and restarted at any time."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Run:
     """One method on one task with one seed, in a folder of its own.
 
     Attributes:
-        task, goal, method, seed: what is run; ``goal`` may be ``None``.
-        path (Path): its run folder.
-        command (sequence of str): begins the run, without ``run_dir`` and ``frames``.
-        frames (int): its budget.
+        task, goal, method, seed: identify the run; ``goal`` may be ``None``.
+        path (Path): the run folder.
+        command (sequence of str): command of the run, without ``run_dir`` and ``frames``.
+        frames (int): budget of the run.
     """
 
     task: str
@@ -60,12 +60,12 @@ class Run:
 
     @property
     def key(self) -> tuple[str, ...]:
-        """What tells its rows in the table from those of others."""
+        """Identifies the run's rows in the table."""
         return _key(vars(self))
 
     @property
     def is_finished(self) -> bool:
-        """Whether it ended, and not with a smaller budget than it has now."""
+        """Whether it finished with at least its current budget."""
         path = self.path / "summary.json"
         if not path.is_file():
             return False
@@ -77,10 +77,10 @@ class Run:
         return (self.path / "config.yaml").is_file()
 
     def check_settings(self) -> None:
-        """Refuse to take a run with other settings for this one.
+        """Check that the run in this folder has these settings.
 
         Raises:
-            ValueError: if it was begun with others.
+            ValueError: if it was started with other settings.
         """
         path, asked = self.path / SETTINGS, self.command[1:]
         begun = path.read_text("utf-8").splitlines() if path.is_file() else asked
@@ -92,41 +92,41 @@ class Run:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a process works in its folder, perhaps one of an earlier queue."""
+        """Whether a process uses its folder, perhaps one of an earlier queue."""
         return self.path.is_dir() and RunFolder.is_locked(self.path)
 
     @property
     def folder(self) -> RunFolder | None:
-        """What it logged, once it has begun."""
+        """Its run folder, for reading logs, once it has started."""
         from omegaconf import OmegaConf
 
-        # Its series are read every second; its configuration, 30 ms to parse, is not needed.
+        # Read every second, so skip the configuration, which takes 30 ms to parse.
         return RunFolder(self.path, OmegaConf.create()) if self.has_begun else None
 
     @cached_property
     def episodes(self) -> int:
-        """Of each evaluation; there is a configuration to read it from."""
+        """Episodes per evaluation; requires a run that has started."""
         from omegaconf import OmegaConf
 
         return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Of its command, without the seed."""
+        """Settings in its command, without the seed."""
         return tuple(each for each in self.command[1:] if not each.startswith("seed="))
 
     @property
     def stem(self) -> str:
-        """Its path without the seed at the end."""
+        """Its path without a seed at the end."""
         return str(self.path).removesuffix(str(self.seed))
 
     @property
     def log(self) -> Path:
-        """What its process prints: into the folder of the first of several seeds."""
+        """Output of its process, in the folder of the first seed if several share the process."""
         return (self.leader or self).path / "log.txt"
 
     def rows(self, status: str) -> Iterator[dict[str, Any]]:
-        """Its evaluations, oldest first."""
+        """Rows of the table, one per evaluation, oldest first."""
         folder = self.folder
         if folder is None or not (starts := folder.versions):
             return
@@ -148,8 +148,7 @@ class Run:
 
 
 def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
-    """Begin a run, or several that differ in their seeds alone, in one process; or go on where an
-    earlier start was stopped, if they have begun."""
+    """Start or resume a run, or several that differ only in seed, in one process."""
     first, *others = runs
     script, *settings = first.command
     if first.has_begun:
@@ -166,7 +165,7 @@ def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
             write_atomically(run.path / SETTINGS, "\n".join(run.command[1:]))
     command = [sys.executable, script, where, f"frames={first.frames}", *settings]
     with first.log.open("a", encoding="utf-8") as log:
-        # In a session of its own: a Ctrl-C in the terminal is for the queue to pass on.
+        # In a separate session, so that only the queue handles a Ctrl-C in the terminal.
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -183,25 +182,24 @@ def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
 class Sweep:
     """Runs a queue with several processes at a time and keeps one table of all evaluations.
 
-    A run that is finished is left alone, be it that only its rows in the table are left; one that
-    was begun, or that ended with a smaller budget, goes on from its last checkpoint; one that fails
-    is tried again, ``attempts`` times in all. However the queue itself ends, its runs end with it
-    or before.
+    Finished runs are skipped, even if only their rows in the table exist. Unfinished runs and those
+    with a smaller budget resume from their last checkpoint. A failed run is restarted, up to
+    ``attempts`` starts in all. If the queue ends for any reason, its runs end too.
 
     Args:
-        runs (sequence of Run): what to run, in this order.
+        runs (sequence of Run): the runs, in order.
         folder (path): holds the runs' folders and ``results.csv``.
 
     Keyword Args:
-        jobs (int): processes at a time.
-        attempts (int): starts of one run, at most. Default: 3.
-        seeds_at_once (bool): runs that differ in their seeds alone, and whose paths end with them,
-            in one process, which on a GPU updates them in one pass; one that did not end well there
-            is tried again by itself. Default: ``False``.
+        jobs (int): maximum number of processes at a time.
+        attempts (int): maximum number of starts of one run. Default: 3.
+        seeds_at_once (bool): share a process between runs that differ only in seed and whose paths
+            end with it; on a GPU they are updated in one pass. A run that fails there is restarted
+            alone. Default: ``False``.
 
     Raises:
-        ValueError: if one of the runs was begun with other settings.
-        RuntimeError: if another queue works in this folder.
+        ValueError: if a run was started earlier with other settings.
+        RuntimeError: if another queue uses this folder.
     """
 
     def __init__(
@@ -225,13 +223,13 @@ class Sweep:
             raise RuntimeError(
                 f"Another queue works in {self.folder}; wait for it, or give another folder."
             ) from None
-        # Rows of earlier queues, perhaps of other machines: tables travel, run folders do not.
+        # Rows of earlier queues, perhaps copied from other machines without the run folders.
         self._earlier = self._read()
         ended = (row for row in self._earlier if row["status"] == "finished")
-        self._done = {_key(row): float(row["frames"]) for row in ended}  # of its last row
+        self._done = {_key(row): float(row["frames"]) for row in ended}  # frames of the last row
 
     def __iter__(self) -> Iterator[Sequence[Run]]:
-        """Work through the queue; yields about once a second, for a display."""
+        """Run the queue; yields about once a second, for a display."""
         environ = os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
         written = -math.inf
         try:
@@ -253,7 +251,7 @@ class Sweep:
             self.stop()
 
     def _divided(self, runs: Sequence[Run]) -> list[list[Run]]:
-        """These runs, those together that share a process."""
+        """Group runs that share a process."""
         shared: dict[tuple[Any, ...], list[Run]] = {}
         for run in runs:
             alone = run.starts or not self.seeds_at_once or run.stem == str(run.path)
@@ -262,7 +260,7 @@ class Sweep:
         return list(shared.values())
 
     def status(self, run: Run) -> str:
-        """waiting, running, finished, failed, or, of one not in this queue's hands, unfinished."""
+        """Status of a run: waiting, running, finished or failed."""
         if run.process is not None and run.process.poll() is None:
             return "running"
         if run.is_finished or self._done.get(run.key, -math.inf) >= run.frames:
@@ -270,7 +268,7 @@ class Sweep:
         return "failed" if run.starts >= self.attempts else "waiting"
 
     def stop(self) -> None:
-        """Ask what runs to save and end, wait for that, and write the table."""
+        """Ask running processes to save and exit, wait for them, and write the table."""
         active = {run.process for run in self.runs if self.status(run) == "running"}
         for process in active:
             process.send_signal(signal.SIGTERM)
@@ -283,7 +281,7 @@ class Sweep:
         self._lock.release()
 
     def write(self) -> None:
-        """One row per evaluation of every run of the queue, and what the table held of others."""
+        """Write one row per evaluation of every run, and keep rows of other runs in the table."""
         rows = [row for run in self.runs for row in run.rows(self.status(run))]
         mine = {_key(row) for row in rows}
         text = io.StringIO()
@@ -306,8 +304,7 @@ def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def end_with_parent() -> None:
-    """Let the kernel stop this process when the one that started it is killed; it then saves and
-    ends."""
+    """On Linux, receive SIGTERM when the parent process dies; a run then saves and exits."""
     if sys.platform == "linux":
         set_parent_death_signal = 1
         ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)

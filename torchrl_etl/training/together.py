@@ -1,4 +1,4 @@
-"""Several runs that differ in their seeds, in one process: what fills a GPU."""
+"""Several seeds of a run in one process, to make use of a GPU."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ __all__ = ["together"]
 
 
 def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
-    """Do all works in turns, and updates that are due at the same time together.
+    """Interleave several works, and run updates that are due at the same time in one pass.
 
-    Each asks its simulators for a batch before any of them waits for one.
-    A work that is ahead of others in its stage, as one that was resumed can be, waits for them.
-    Each work finds the random generators as it left them: it ends with the numbers of
-    :func:`~torchrl_etl.training.work.alone`, up to rounding. One that fails, or is stopped, leaves
-    the others to go on.
+    Each work requests a batch from its simulators before any of them waits for one. A work that is
+    ahead of others in its stage, as after a resume, waits for them. Each has its own RNG state, so
+    its results equal those of :func:`~torchrl_etl.training.work.alone` up to rounding. If one fails
+    or is stopped, the others continue.
 
     Args:
-        works (sequence of generator): runs or stages, as :func:`~torchrl_etl.training.work.alone`
-            takes one.
+        works (sequence of generator): runs or stages, as for
+            :func:`~torchrl_etl.training.work.alone`.
 
     Returns:
-        list: what each work returned, or the exception that ended it.
+        list: the return value of each work, or the exception that ended it.
     """
     if len(works) == 1:
         try:
@@ -43,14 +42,14 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
         while waiting := _those_with_updates_due(runs):
             learners = {run.due.learner for run in waiting}
             for done in [group for group in groups if learners.isdisjoint(group)]:
-                del groups[done]  # which holds a copy of all their weights
+                del groups[done]  # frees its copy of all their weights
             alike = defaultdict(list)
             for run in _behind(waiting):
                 alike[run.alike].append(run)
             for each in alike.values():
                 try:
                     found = _updated(each, groups)
-                except Exception as fault:  # a GPU without memory, say
+                except Exception as fault:  # out of GPU memory, for example
                     for run in each:
                         run.go_on(None, fault)
                 else:
@@ -63,7 +62,7 @@ def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
 
 
 class _Run(Generic[Result]):
-    """A work, what it waits for, and its own state of the random generators."""
+    """A work, its due updates, and its RNG state."""
 
     def __init__(self, work: Work[Result]) -> None:
         self.work, self.random = work, GlobalRNGState().state_dict()
@@ -73,7 +72,7 @@ class _Run(Generic[Result]):
 
     @property
     def alike(self) -> tuple[Any, ...]:
-        """What is the same for runs that can be updated together."""
+        """Key that is equal for runs that can be updated together."""
         return self.due.stage, self.due.inputs["batch"].shape, self.due.learner.pace
 
     def __enter__(self) -> None:
@@ -93,7 +92,7 @@ class _Run(Generic[Result]):
 
 
 def _those_with_updates_due(runs: Sequence[_Run]) -> list[_Run]:
-    """All that have not ended, once each of them has come to its next updates."""
+    """Advance all runs to their next updates; returns those that have not ended."""
     while on := [run for run in runs if run.due is None and not run.ended]:
         for run in on:
             run.go_on(None)
@@ -101,7 +100,7 @@ def _those_with_updates_due(runs: Sequence[_Run]) -> list[_Run]:
 
 
 def _behind(runs: Sequence[_Run]) -> list[_Run]:
-    """Those that have had the fewest updates in their stage."""
+    """The runs with the fewest updates in their stage."""
     fewest: dict[str, int] = {}
     updates = [run.due.learner.num_updates for run in runs]
     for run, own in zip(runs, updates, strict=True):
@@ -112,7 +111,7 @@ def _behind(runs: Sequence[_Run]) -> list[_Run]:
 def _updated(
     runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]
 ) -> list[TensorDictBase]:
-    """Scalars of the updates of these runs, which are in the same stage."""
+    """Run the due updates of these runs, all in the same stage; returns their scalars."""
     learners = tuple(run.due.learner for run in runs)
     if len(runs) == 1:
         with runs[0]:

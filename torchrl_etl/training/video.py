@@ -1,4 +1,4 @@
-"""Episodes of a policy as pictures, muscles in the colour of their activation."""
+"""Videos of a policy, with muscles colored by their activation."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ __all__ = ["EpisodeRecorder", "check_video_size"]
 
 _FINGER = 0.05  # m
 _BACKDROP = [0.93, 0.94, 0.96, 1.0]
-_MOST_PIXELS = 4096  # in either direction: what decoders of MP4 can be relied on to show
+_MOST_PIXELS = 4096  # per dimension: what MP4 decoders reliably support
 
 
 def check_video_size(size: Sequence[int], *, episodes: int = 1, sides: int = 1) -> tuple[int, int]:
-    """Height and width of an episode's picture, if a video can have them.
+    """Check height and width of one episode's frames; returns them.
 
     Args:
         size (sequence of int): height and width.
 
     Keyword Args:
-        episodes (int): how many are in the grid. Default: 1.
-        sides (int): how many grids are side by side. Default: 1.
+        episodes (int): number of episodes in a grid. Default: 1.
+        sides (int): number of grids side by side. Default: 1.
 
     Raises:
-        ValueError: if they are not two even numbers from 16 to 4096 (the usual coding of colours
-            in MP4 takes two by two pixels together), or all episodes together are larger.
+        ValueError: if they are not two even numbers from 16 to 4096 (MP4 usually subsamples colors
+            two by two), or if the frame with all episodes exceeds 4096.
 
     Examples:
         >>> check_video_size([480, 640])
@@ -70,24 +70,24 @@ def check_video_size(size: Sequence[int], *, episodes: int = 1, sides: int = 1) 
 
 
 class EpisodeRecorder:
-    """Draws a MuJoCo environment while a policy acts in it, headless too.
+    """Records a MuJoCo environment while a policy acts in it; works headless.
 
-    Tendons have the colours of :func:`~torchrl_etl.analysis.viewer.muscles.colors`: slate at rest,
-    red when active. Time in the frames is that of the simulation, 25 to a second.
+    Tendons are colored by activation (:func:`~torchrl_etl.analysis.viewer.muscles.colors`): slate
+    at rest, red when active. The frame rate is 25 per second of simulated time.
 
     Args:
         env (EnvBase): a single environment on MuJoCo, transforms included.
 
     Keyword Args:
         size (tuple of int): height and width in pixels.
-        camera (str, optional): a camera of the model, which sees the whole scene. Default: one that
-            keeps the body in the middle and leaves out what stands around it for show.
-        azimuth (float): where that one looks, in degrees from the world's x towards its y.
-            Default: 132.
+        camera (str, optional): a camera of the model, which shows the whole scene. Default: a
+            camera that centers the body and hides scenery.
+        azimuth (float): viewing direction of the default camera, in degrees from the world's x
+            towards its y. Default: 132.
         seconds (float): simulated seconds after which an episode is cut. Default: 10.
 
     Raises:
-        RuntimeError: if the machine has no way to draw, naming what to install.
+        RuntimeError: if rendering fails; the message names what to install.
         ValueError: if the environment does not run on MuJoCo or has no such camera.
     """
 
@@ -104,17 +104,17 @@ class EpisodeRecorder:
         self._model, self._data = mujoco_state(env)
         model = self._model
         with extra("video"):
-            import imageio.v2  # noqa: F401  (what will write the frames: missed now, not later)
+            import imageio.v2  # noqa: F401  (writes the frames later: fail now if it is missing)
             import mujoco
         cameras = [model.camera(i).name for i in range(model.ncam)]
         if camera is not None and camera not in cameras:
             named = ", ".join(cameras) or "none"
             raise ValueError(f"There is no camera {camera!r}; the model has {named}.")
         self._camera = camera
-        # The default frame buffer of most models is smaller than a readable picture.
+        # The default frame buffer of most models is too small.
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
-        # Resets, and the renderer takes over a terrain as it is.
+        # has_free_root resets the environment, before the renderer copies its terrain.
         self._follows, self._framed = has_free_root(env), None
         try:
             self._renderer = mujoco.Renderer(model, *size)
@@ -124,21 +124,21 @@ class EpisodeRecorder:
                 "(Debian: apt-get install libegl1, or libosmesa6 for software rendering) and set "
                 "MUJOCO_GL=egl or MUJOCO_GL=osmesa."
             ) from error
-        for costly in ("SHADOW", "REFLECTION"):  # seconds a picture without a GPU
+        for costly in ("SHADOW", "REFLECTION"):  # seconds per frame without a GPU
             self._renderer.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{costly}")] = 0
         if camera is None:
             around = scenery(model) | (planes(model) & (not self._follows))
-            model.geom_group[around] = SHOWN_GROUPS  # the first that are not
-            zones = model.site_size.max(1) > _FINGER  # which would hide a hand
+            model.geom_group[around] = SHOWN_GROUPS  # the first hidden group
+            zones = model.site_size.max(1) > _FINGER  # site markers large enough to hide a hand
             model.site_rgba[zones, 3] = model.site_rgba[zones, 3].clip(max=0.15)
-            light = model.vis.headlight  # the room's lamps leave with the room
+            light = model.vis.headlight  # even light from the camera
             light.active, light.ambient[:], light.diffuse[:] = 1, 0.4, 0.5
 
     def record(
         self, policy: TensorDictModuleBase, episodes: int, *, seed: int = EVALUATION_SEED
     ) -> list[np.ndarray]:
-        """Frames [T, H, W, 3] of each of the first evaluation episodes, without noise; ``seed`` is
-        that of the first, see :func:`~torchrl_etl.training.evaluate`."""
+        """Frames [T, H, W, 3] of each episode under the deterministic policy; ``seed`` is that of
+        the first, as in :func:`~torchrl_etl.training.evaluate`."""
         with as_evaluated(self._env):
             return [self._episode(policy, seed + number) for number in range(episodes)]
 
@@ -156,7 +156,7 @@ class EpisodeRecorder:
         return np.stack([*frames, self.draw()])
 
     def draw(self) -> np.ndarray:
-        """The present state [H, W, 3]."""
+        """Render the current state [H, W, 3]."""
         import mujoco  # there, since its model is
 
         from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
@@ -168,13 +168,13 @@ class EpisodeRecorder:
         for geom in scene.geoms[: scene.ngeom]:
             if geom.objtype == tendon and geom.objid in pulled:
                 geom.matid, geom.rgba[:3] = -1, shades[pulled[geom.objid]]
-                geom.emission = 0.5  # the colour is what is to be read, not its shading
+                geom.emission = 0.5  # emission keeps the color readable under shading
         if self._framed is not None and not self._follows:
             self._add_backdrop()
         return self._renderer.render()
 
     def _add_backdrop(self) -> None:
-        """A light wall behind the body in place of the room, so that dark tendons are seen."""
+        """Add a light wall behind the body, so that dark tendons are visible."""
         import mujoco  # there, since its model is
 
         scene, eye = self._renderer.scene, self._renderer.scene.camera[0]
@@ -188,7 +188,7 @@ class EpisodeRecorder:
         scene.ngeom += 1
 
     def _view(self) -> Any:
-        """From the side, as the viewer begins; it goes with a body that walks away."""
+        """Default camera, as in the viewer; it follows a body with a free root."""
         import mujoco  # there, since its model is
 
         if not self._follows and self._framed is not None:
@@ -200,7 +200,7 @@ class EpisodeRecorder:
         return view
 
     def close(self) -> None:
-        """Give back what the drawing took; the environment stays open."""
+        """Release the renderer; the environment stays open."""
         self._renderer.close()
 
     def __enter__(self) -> EpisodeRecorder:

@@ -1,4 +1,4 @@
-"""Work that pauses where it would wait, so that runs can do so together."""
+"""Work that yields where it would wait, so that several runs can be interleaved."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Result = TypeVar("Result")
 
 
 class Due(NamedTuple):
-    """Updates that a learner has earned, on these inputs [k], in the stage of this name."""
+    """Updates that are due for a learner, with their inputs [k] and the name of the stage."""
 
     stage: str
     learner: SACLearner
     inputs: TensorDictBase
 
 
-# It yields what is due, is sent the scalars [k] of those updates, and returns what it is done for.
-# Before it waits for a batch that others collect it yields None, and goes on when told to.
+# Yields due updates, receives their scalars [k], and returns its result. It also yields None before
+# it waits for a batch from other processes.
 Work: TypeAlias = Generator[Due | None, TensorDictBase | None, Result]
 
 
 def alone(work: Work[Result]) -> Result:
-    """Do the work, all updates when they are due."""
+    """Run the work by itself, with each update as it becomes due."""
     with closing(work):
         try:
             due = next(work)
