@@ -1,4 +1,4 @@
-"""What condenses muscle actions into synergies, one kind a file."""
+"""Models that extract synergies from muscle actions, one per file."""
 
 from torchrl_etl.synergies.affine import AffineSynergies
 from torchrl_etl.synergies.bundle import copy_bundle, load_bundle, save_bundle

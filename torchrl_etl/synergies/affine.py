@@ -1,4 +1,4 @@
-"""What kinds of synergies share that add up, through a basis that is found in one go."""
+"""Base class of synergy models with a linear basis, fitted in one call."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _MOST_ROWS = 20_000
 
 
 class AffineSynergies(SynergyModel):
-    """A model whose coefficients a basis [d, n] turns into actions, perhaps before the bounds.
+    """A model that maps coefficients to actions through a basis [d, n], perhaps before the bounds.
 
-    A subclass says how it factorizes (:meth:`factorize`), and how actions become coefficients
-    (:meth:`coefficients`) and coefficients actions (:meth:`compose`). The decoder is
-    :meth:`~torchrl_etl.modules.SynergyDecoder.from_directions` with the slope of :meth:`compose` in
-    the middle of the box, which spans the 1st to the 99th percentile of each coefficient.
+    A subclass defines how to fit the basis (:meth:`factorize`), how to encode actions
+    (:meth:`coefficients`) and how to decode coefficients (:meth:`compose`). The decoder comes from
+    :meth:`~torchrl_etl.modules.SynergyDecoder.from_directions`, with the slope of :meth:`compose`
+    at the middle of the box. The box spans the 1st to 99th percentile of each coefficient.
 
     Args:
         low, high (Tensor): bounds of the action [n].
@@ -39,7 +39,7 @@ class AffineSynergies(SynergyModel):
 
     basis: Tensor | None = None
     highest: ClassVar[float] = NEAREST
-    """As far up as a muscle may be in the middle of the box, where the bounds are ±1."""
+    """Largest action at the middle of the box, in units where the bounds are ±1."""
 
     def __init__(self, low: Tensor, high: Tensor, num_synergies: int) -> None:
         check_integer(1, num_synergies=num_synergies)
@@ -52,18 +52,18 @@ class AffineSynergies(SynergyModel):
 
     @abstractmethod
     def factorize(self, actions: np.ndarray) -> np.ndarray:
-        """The basis [d, n] of actions [N, n], which are in double precision."""
+        """Fit the basis [d, n] to actions [N, n] in double precision."""
 
     @abstractmethod
     def coefficients(self, actions: Tensor) -> Tensor:
-        """Coefficients [*, d] of actions [*, n], on no particular scale."""
+        """Coefficients [*, d] of actions [*, n], at any scale."""
 
     @abstractmethod
     def compose(self, coefficients: Tensor) -> Tensor:
         """Actions [*, n] of coefficients [*, d]."""
 
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
-        """See the base class; of more than 20,000 actions every second, third, ... is taken."""
+        """See the base class; more than 20,000 actions are subsampled at a regular stride."""
         on_update()
         least = max(2, self.num_synergies)
         rows = as_actions(actions, low=self.low, high=self.high, min_rows=least)
@@ -85,7 +85,7 @@ class AffineSynergies(SynergyModel):
         )
 
     def inside(self, center: Tensor) -> Tensor:
-        """The action [n] in the middle of the box, brought inside the bounds if need be."""
+        """Clamp the action [n] at the middle of the box to lie inside the bounds."""
         half = (self.high - self.low) / 2
         unit = (center - self.low) / half - 1
         return self.low + half * (unit.clamp(-NEAREST, self.highest) + 1)

@@ -1,9 +1,8 @@
-"""The synergy bundle: a learned decoder on disk, in two files that hold no code.
+"""The synergy bundle: a learned decoder on disk, in two files without code.
 
-``synergies.safetensors`` is the decoder's state dict, and with the prefix ``encoder.`` that of the
-model it encodes with, if it has one. ``synergies.json`` is everything else: how to rebuild them,
-which muscles they are of and within which bounds, facts about the training, and the SHA-256 of the
-tensors.
+``synergies.safetensors`` holds the state dict of the decoder and, with the prefix ``encoder.``, of
+its encoder if it has one. ``synergies.json`` holds everything else: constructor arguments, actuator
+names and bounds, facts about the training, and the SHA-256 of the tensors.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ __all__ = ["BUNDLE_FILES", "bundle_files", "copy_bundle", "load_bundle", "save_b
 _ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
 BUNDLE_FILES = (_TENSORS, DESCRIPTION)
-"""What a bundle consists of."""
+"""File names of a bundle."""
 
 
 def save_bundle(
@@ -51,29 +50,29 @@ def save_bundle(
     facts: Mapping[str, Any] | None = None,
     kind: str | None = None,
 ) -> Path:
-    """Write a decoder and its description to the folder ``path``, whole or not at all.
+    """Write a decoder and its description to the folder ``path``, atomically.
 
-    With the decoder goes the encoder that it carries, if any, so that who loads it can relabel
-    recorded actions.
+    The decoder's encoder, if any, is saved too, so that a loaded decoder can relabel recorded
+    actions.
 
-    A bundle already there is replaced. A crash at any point leaves the old bundle or the new one
-    for :func:`load_bundle` to find. One process at a time may save to a path.
+    An existing bundle is replaced. After a crash, :func:`load_bundle` finds either the old bundle
+    or the new one. Only one process at a time may save to a path.
 
     Args:
         decoder (SynergyDecoder): the decoder.
         path (path-like): the bundle's folder; parents are created.
 
     Keyword Args:
-        task (str): the task whose exploration gave the synergies.
+        task (str): the task in which the synergies were explored.
         actuators (sequence of str): names of the n actuators, in action order.
-        facts (mapping, optional): anything JSON can hold; scalars of torch and numpy and paths are
-            converted, numbers that are not finite become null.
+        facts (mapping, optional): JSON-serializable values; paths and torch or numpy scalars are
+            converted, non-finite numbers become null.
         kind (str, optional): kind of synergies. Default: ``"affine"`` for a decoder without hidden
             layers, else ``"gmvae"``.
 
     Raises:
-        BundleError: if task or kind are no text, the names do not fit the decoder, a fact cannot
-            be written as JSON, or ``path`` holds anything but a bundle.
+        BundleError: if task or kind is not a string, the names do not fit the decoder, a weight is
+            not finite, a fact is not JSON-serializable, or ``path`` holds other files.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -135,10 +134,10 @@ def load_bundle(
     in_keys: Sequence[NestedKey] = ("synergy",),
     out_keys: Sequence[NestedKey] = ("action",),
 ) -> tuple[SynergyDecoder, BundleInfo]:
-    """Read a bundle from its folder, or from the run folder that holds it as ``synergies/``.
+    """Read a bundle from its folder, or from a run folder with a subfolder ``synergies/``.
 
-    Nothing in a bundle is executed: the tensors are read as safetensors only. The digest guards
-    against damage, not against forgery.
+    No code in a bundle is executed: tensors are read as safetensors only. The digest detects
+    damage, not tampering.
 
     Args:
         path (path-like): the bundle's folder, or a run folder.
@@ -181,7 +180,7 @@ def load_bundle(
         )
     config = dict(info.config) if residual is None else {**info.config, "residual": residual}
     try:
-        # The weights drawn here are overwritten at once: do not let them advance the global seed.
+        # Initial weights are overwritten at once, so drawing them must not advance the global RNG.
         with torch.random.fork_rng(devices=[]):
             decoder = SynergyDecoder(**config, in_keys=in_keys, out_keys=out_keys)
             encoder = None if info.encoder is None else GMVAE(**info.encoder)
@@ -205,15 +204,15 @@ def load_bundle(
 
 
 def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> Path:
-    """Copy a bundle to the folder ``target`` as it is, whole or not at all.
+    """Copy a bundle unchanged to the folder ``target``, atomically.
 
     Args:
         source (path-like): the bundle's folder, or a run folder.
-        target (path-like): a folder; a bundle that is there already is replaced.
+        target (path-like): a folder; an existing bundle is replaced.
 
     Raises:
-        BundleError: if there is no bundle at ``source``, it is damaged, or ``target`` holds
-            anything but a bundle.
+        BundleError: if there is no bundle at ``source``, it is damaged, or ``target`` holds other
+            files.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -232,7 +231,7 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
 
 
 def bundle_files(path: str | os.PathLike[str]) -> dict[str, bytes]:
-    """The files of a whole bundle by name, to be put somewhere else.
+    """The contents of an undamaged bundle's files, by name.
 
     Raises:
         BundleError: if there is no bundle, or it is damaged.
@@ -243,7 +242,7 @@ def bundle_files(path: str | os.PathLike[str]) -> dict[str, bytes]:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """Turn ``value`` into what JSON can hold."""
+    """Convert ``value`` to JSON-serializable types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item, f"{where}[{key!r}]") for key, item in value.items()}
     if isinstance(value, (list, tuple)):

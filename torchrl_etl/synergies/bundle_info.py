@@ -1,4 +1,4 @@
-"""What a synergy bundle says of itself, and whether it fits an environment."""
+"""The description of a synergy bundle, and its compatibility with an environment."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ __all__ = [
 
 DESCRIPTION = "synergies.json"
 COPY_AGAIN = "copy the bundle again, with both its files"
-FORMAT_VERSION = 2  # 1 had neither kind nor encoder
+FORMAT_VERSION = 2  # version 1 had neither kind nor encoder
 
 
 class BundleError(ValueError):
-    """A synergy bundle cannot be written, read or used; the message says why and what helps."""
+    """A synergy bundle cannot be written, read or used; the message says why and how to fix it."""
 
 
 @dataclass(frozen=True)
 class BundleInfo:
-    """What ``synergies.json`` says.
+    """Contents of ``synergies.json``.
 
     Args:
-        task (str): the task whose exploration gave the synergies.
+        task (str): the task in which the synergies were explored.
         actuators (tuple of str): names of the n actuators, in action order.
         low, high (tuple of float): action bounds [n].
         num_synergies (int): number d of synergies.
         residual (float): residual share of the decoder.
         config (dict): constructor arguments of the decoder.
         sha256 (str): digest of the tensors file.
-        facts (dict): frames, seed, commit, versions, variance accounted for, and the like.
+        facts (dict): frames, seed, commit, versions, variance accounted for, and so on.
         kind (str): kind of synergies, such as ``"gmvae"`` or ``"nmf"``.
         encoder (dict, optional): constructor arguments of the encoder, if there is one.
-        format_version (int): version of this layout.
+        format_version (int): version of the format.
     """
 
     task: str
@@ -67,7 +67,7 @@ class BundleInfo:
 
 
 def read_description(folder: Path) -> BundleInfo:
-    """What ``synergies.json`` in a bundle's folder says.
+    """Read ``synergies.json`` in a bundle's folder.
 
     Raises:
         BundleError: if it cannot be read, is damaged, or has another format version.
@@ -82,7 +82,7 @@ def read_description(folder: Path) -> BundleInfo:
             f"{path} has format version {version!r} and this torchrl_etl reads 1 and "
             f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
         )
-    content.pop("num_components", None)  # earlier bundles repeat the encoder's
+    content.pop("num_components", None)  # redundant entry of earlier bundles
     known = {item.name for item in fields(BundleInfo)}
     if version == 1:
         content = {"kind": "", "encoder": None, **content}
@@ -117,15 +117,15 @@ def check_compatible(
     low: float | Sequence[float] | Tensor,
     high: float | Sequence[float] | Tensor,
 ) -> None:
-    """Refuse a bundle whose actuators or bounds are not the environment's.
+    """Raise if a bundle's actuators or bounds differ from the environment's.
 
     Args:
-        info (BundleInfo): what :func:`load_bundle` returned.
+        info (BundleInfo): description returned by :func:`load_bundle`.
         actuators (sequence of str): the environment's actuator names, in action order.
-        low, high (float, sequence of float or Tensor): its action bounds, one or [n].
+        low, high (float, sequence of float or Tensor): its action bounds, scalar or [n].
 
     Raises:
-        BundleError: naming what came, what was expected and the likeliest explanation.
+        BundleError: with both values and the most likely explanation.
 
     Examples:
         >>> from torchrl_etl.synergies import BundleInfo
@@ -157,7 +157,7 @@ def check_compatible(
 
 
 def default_kind(is_affine: bool) -> str:
-    """The kind of a decoder of which nothing else is known."""
+    """The kind of a decoder for which none is recorded."""
     return "affine" if is_affine else "gmvae"
 
 
@@ -196,6 +196,6 @@ def _explain_names(info: BundleInfo, actuators: tuple[str, ...]) -> str:
 
 
 def some(names: Sequence[str]) -> str:
-    """The first three names, and how many more there are."""
+    """The first three names, and the number of others."""
     rest = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(map(repr, names[:3])) + rest

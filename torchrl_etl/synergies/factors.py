@@ -1,7 +1,7 @@
-"""scikit-learn's factors, without what it complains of that changes nothing here.
+"""scikit-learn's factorizations, without warnings that do not matter here.
 
-It takes a second to import, which a worker that only decodes should not spend: no file does so at
-its top.
+Importing scikit-learn takes a second, which workers that only decode should not spend, so functions
+import it when called.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["make_nmf", "principal_components", "unfinished"]
 
 
 def principal_components(rows: np.ndarray, count: int, **options: Any) -> PCA:
-    """Fit PCA; on its way it divides by the total variance, which constant rows do not have."""
+    """Fit PCA; ignores its division by the total variance, which is zero for constant rows."""
     with extra("synergies"):
         from sklearn.decomposition import PCA
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -30,7 +30,7 @@ def principal_components(rows: np.ndarray, count: int, **options: Any) -> PCA:
 
 
 def make_nmf(count: int, max_iter: int = 500) -> NMF:
-    """A factorization into ``count`` parts that begins alike every time."""
+    """NMF with ``count`` components and a deterministic initialization."""
     with extra("synergies"):
         from sklearn.decomposition import NMF
     return NMF(count, init="nndsvda", max_iter=max_iter, random_state=0)
@@ -38,7 +38,7 @@ def make_nmf(count: int, max_iter: int = 500) -> NMF:
 
 @contextmanager
 def unfinished() -> Iterator[None]:
-    """The last digits that more iterations would bring do not change a synergy."""
+    """Silence convergence warnings: more iterations would not change a synergy noticeably."""
     from sklearn.exceptions import ConvergenceWarning
 
     with warnings.catch_warnings():

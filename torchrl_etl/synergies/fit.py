@@ -1,4 +1,4 @@
-"""Synergies of anyone's array of actions or muscle activity."""
+"""Fit synergies to any array of actions or muscle activity."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SYNERGY_MODELS: Mapping[str, type[SynergyModel]] = {
     model.kind: model
     for model in (GMVAESynergies, VAESynergies, PCASynergies, NMFSynergies, SARSynergies)
 }
-"""Kinds of synergies by name; ``"my_module:MySynergies"`` names one's own."""
+"""Kinds of synergies by name; ``"my_module:MySynergies"`` names a user's own."""
 
 
 def fit_synergies(
@@ -40,17 +40,17 @@ def fit_synergies(
     Args:
         actions (array): [N, n] between the bounds: a tensor, a NumPy array or lists.
         kind (str or type): ``"gmvae"``, ``"vae"``, ``"pca"``, ``"nmf"`` or ``"sar"``, see
-            :data:`~torchrl_etl.synergies.SYNERGY_MODELS`; a model of one's own is its class, or
+            :data:`~torchrl_etl.synergies.SYNERGY_MODELS`; for your own model, its class or
             ``"my_module:MySynergies"``.
         num_synergies (int): d, at most n.
 
     Keyword Args:
-        low, high (float, sequence of float or Tensor): bounds, one or [n]; of normalized EMG they
-            are 0 and 1. Default: -1 and 1.
-        **options: of the class of that kind.
+        low, high (float, sequence of float or Tensor): bounds, scalar or [n]; 0 and 1 for
+            normalized EMG. Default: -1 and 1.
+        **options: keyword arguments of the model's class.
 
     Returns:
-        SynergyModel: the fitted model; ``model.save(path, actions, ...)`` leaves a bundle of it.
+        SynergyModel: the fitted model; ``model.save(path, actions, ...)`` writes its bundle.
 
     Raises:
         TypeError, ValueError: before anything is fitted, if the kind is unknown, or actions or

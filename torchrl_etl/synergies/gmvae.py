@@ -1,4 +1,4 @@
-"""Synergies of a Gaussian-mixture VAE: the paper's (Eqs. 7 to 9)."""
+"""Synergies of a Gaussian-mixture VAE, as in the paper (Eqs. 7 to 9)."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class GMVAESynergies(SynergyModel):
         num_synergies (int): d.
 
     Keyword Args:
-        num_components (int, optional): of the mixture. Default: d; 1 is an ordinary VAE.
-        hidden (sequence of int): widths of its layers.
+        num_components (int, optional): mixture components. Default: d; 1 is an ordinary VAE.
+        hidden (sequence of int): widths of the hidden layers.
         lr (float): learning rate.
         kl_weight, component_kl_weight (float): see :class:`~torchrl_etl.objectives.GMVAELoss`.
-        updates (int): of :meth:`fit`.
+        updates (int): number of updates in :meth:`fit`.
     """
 
     kind = "gmvae"
@@ -78,7 +78,7 @@ class GMVAESynergies(SynergyModel):
         return self.model.reconstruct(actions)
 
     def describe(self, actions: Tensor) -> tuple[dict[str, float], list[str]]:
-        """``effective_components``: exp of the entropy of the mean q(c|a); too few is a fault."""
+        """``effective_components``: exp of the entropy of the mean q(c|a); warns of a collapse."""
         shares = component_shares(self.model, actions)
         effective = torch.special.entr(shares).sum().exp().item()
         faults = []
@@ -100,7 +100,7 @@ def component_shares(gmvae: GMVAE, actions: Tensor | np.ndarray) -> Tensor:
         tensor(1.)
     """
     actions = as_actions(actions, low=gmvae.low, high=gmvae.high)
-    # In pieces: all hidden layers at once would take far more memory than the answer.
+    # In chunks: hidden layers of all actions at once would take far more memory than the result.
     shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
     return shares / len(actions)
 
@@ -123,14 +123,14 @@ def fit_gmvae(
             dtype.
 
     Keyword Args:
-        updates, batch_size (int), lr (float): of Adam.
-        loss (GMVAELoss, optional): of this GMVAE. Default: one with both weights at 1.
+        updates, batch_size (int), lr (float): options of the training with Adam.
+        loss (GMVAELoss, optional): loss of this GMVAE. Default: both weights at 1.
         on_update (callable): called before every update; may raise to stop.
 
     Raises:
-        TypeError, ValueError: before anything is trained, if the actions are not numbers, have
-            another width than the GMVAE, a value that is not finite or far outside of its bounds,
-            or one row only; if a number is not positive, or the loss is of another GMVAE.
+        TypeError, ValueError: before training, if the actions are not numbers, do not have the
+            width of the GMVAE, are not finite, lie far outside its bounds, or have only one row; if
+            a number is not positive, or the loss belongs to another GMVAE.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""What finds synergies in actions."""
+"""Base class of synergy models."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["SynergyModel"]
 
 
 class SynergyModel(ABC):
-    """Condenses actions of n actuators into d coefficients.
+    """Encodes actions of n actuators as d coefficients.
 
-    A subclass is a file of its own that a configuration names by its kind; ``docs/extend.md`` adds
-    one. It is built from the bounds of the action: ``Model(low, high, num_synergies, **options)``.
+    Each subclass has its own file, and configurations select it by its kind; ``docs/extend.md``
+    adds one. The constructor is ``Model(low, high, num_synergies, **options)`` with action bounds.
 
     Attributes:
-        kind (str): its name in configurations and bundles.
-        loss (LossModule, optional): trained beside stage 1 on entry ``action``; ``None`` for a
-            model that is fitted once, when all actions are known.
+        kind (str): name in configurations and bundles.
+        loss (LossModule, optional): trained during stage 1 on the entry ``action``; ``None`` for a
+            model that is fitted once, on all actions.
         lr (float): learning rate of the loss.
-        updates (int): of :meth:`fit`, where it trains; the picture of VAF sets it for its models.
+        updates (int): updates in :meth:`fit`, if it trains; the VAF figure overrides it.
     """
 
     kind: ClassVar[str]
@@ -39,25 +39,25 @@ class SynergyModel(ABC):
 
     @abstractmethod
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
-        """Fit to actions [N, n], from anew.
+        """Fit to actions [N, n] from scratch.
 
         Keyword Args:
-            on_update (callable): called now and then; may raise to stop.
+            on_update (callable): called at intervals; may raise to stop.
         """
 
     @abstractmethod
     def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
-        """The map from coefficients in [-1, 1]^d to actions, which spans ``actions`` [N, n]."""
+        """The map from coefficients in [-1, 1]^d to actions, scaled to span ``actions`` [N, n]."""
 
     @abstractmethod
     def reconstruct(self, actions: Tensor) -> Tensor:
-        """Actions [*, n] rebuilt from their d coefficients."""
+        """Actions [*, n] reconstructed from their d coefficients."""
 
     def describe(self, actions: Tensor) -> tuple[dict[str, float], list[str]]:
-        """What a kind knows of itself on actions [N, n]: numbers, and in words what is wrong.
+        """Diagnostics specific to this kind on actions [N, n]: numbers, and warnings as text.
 
-        What every kind has is in :func:`~torchrl_etl.analysis.describe_synergies`, which adds this.
-        Which muscles a synergy moves is the decoder's to tell: it has no model once it is loaded.
+        :func:`~torchrl_etl.analysis.describe_synergies` adds them to the diagnostics of all kinds.
+        Which muscles a synergy moves is computed from the decoder, as a bundle has no model.
         """
         return {}, []
 
@@ -70,7 +70,7 @@ class SynergyModel(ABC):
         actuators: Sequence[str],
         facts: Mapping[str, Any] | None = None,
     ) -> Path:
-        """Leave a bundle of the decoder that spans ``actions`` [N, n], with this model's kind.
+        """Save a bundle with this model's kind and its decoder for ``actions`` [N, n].
 
         Args:
             path, task, actuators, facts: see :func:`~torchrl_etl.synergies.save_bundle`.

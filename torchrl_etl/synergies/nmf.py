@@ -1,4 +1,4 @@
-"""Synergies as the literature on motor control finds them: non-negative factors."""
+"""Non-negative synergies, as in the motor control literature."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["NMFSynergies"]
 
 
 class NMFSynergies(AffineSynergies):
-    """Non-negative matrix factorization of how far each action is above its lower bound.
+    """Non-negative matrix factorization of actions relative to their lower bounds.
 
     The model is a = low + c·basis with c, basis ≥ 0 (Lee and Seung, 1999; d'Avella et al., 2003).
-    The decoder has its slope and its action in the middle of the box of coefficients, and bends
-    where a muscle nears its bounds, where the model would pass them.
+    The decoder matches the model's action and slope at the middle of the box of coefficients.
+    Where the model would exceed the bounds of a muscle, the decoder saturates smoothly.
 
     Keyword Args:
-        max_iter (int): iterations of the factorization at most.
+        max_iter (int): maximum number of iterations.
 
     Examples:
         >>> _ = torch.manual_seed(0)
@@ -36,8 +36,8 @@ class NMFSynergies(AffineSynergies):
     """
 
     kind = "nmf"
-    # Beyond, the slope before the bounds is so steep that a small coefficient throws a muscle from
-    # one bound to the other.
+    # Above, the slope before the bounds is so steep that a small change of a coefficient moves a
+    # muscle from one bound to the other.
     highest = 0.9
 
     def __init__(
@@ -50,7 +50,7 @@ class NMFSynergies(AffineSynergies):
     def factorize(self, actions: np.ndarray) -> np.ndarray:
         self.model = make_nmf(self.num_synergies, self.max_iter)
         above = self._above_low(actions)
-        # Where no muscle ever moves there is nothing to divide, and it fails.
+        # The factorization fails on all zeros, as when no muscle is ever active.
         above[0] += 1e-9 * (not above.any())
         with unfinished():
             self.model.fit(above)

@@ -1,4 +1,4 @@
-"""Synergies that are principal directions of the actions before their bounds."""
+"""Synergies as principal components of the actions before their bounds."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["PCASynergies"]
 
 
 class PCASynergies(AffineSynergies):
-    """The mean action, and the directions in which actions vary most, before the bounds.
+    """The mean action and the directions of largest variance, before the bounds.
 
-    The decoder is exactly the model: a = tanh(mean + c·basis) where the bounds are [-1, 1].
+    The decoder equals the model: a = tanh(mean + c·basis) for bounds of [-1, 1].
 
     Examples:
         >>> low, high = -torch.ones(8), torch.ones(8)
@@ -46,7 +46,7 @@ class PCASynergies(AffineSynergies):
         return self.low + (unit + 1) / 2 * (self.high - self.low)
 
     def inside(self, center: Tensor) -> Tensor:
-        return center  # as it is: the decoder then is the model itself
+        return center  # unchanged, so that the decoder equals the model
 
     def _before_bounds(self, actions: Tensor) -> Tensor:
         low, high = self.low.to(actions), self.high.to(actions)

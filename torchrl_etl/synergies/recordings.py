@@ -1,4 +1,4 @@
-"""Recordings of muscles as laboratories keep them: tables with a column for each muscle."""
+"""Read recordings of muscle activity: tables with one column per muscle."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Recording(NamedTuple):
 
     Attributes:
         muscles (tuple of str): names, in the order of the columns.
-        activity (np.ndarray): [N, n], as it was recorded.
-        trials (np.ndarray, optional): the trial of each row [N], as text.
+        activity (np.ndarray): [N, n], as recorded.
+        trials (np.ndarray, optional): the trial of each row [N], as strings.
     """
 
     muscles: tuple[str, ...]
@@ -36,30 +36,30 @@ class Recording(NamedTuple):
 def read_recording(
     path: str | os.PathLike[str], *, trial: str | None = None, leave_out: Sequence[str] = ()
 ) -> Recording:
-    """Read activity of muscles from a ``.csv``, ``.npy`` or ``.npz`` file.
+    """Read muscle activity from a ``.csv``, ``.npy`` or ``.npz`` file.
 
     - ``.csv``: the first line names the columns, which are separated by commas, semicolons or tabs.
-    - ``.npz``: arrays [N] by the names of their muscles, or one array [N, n] and ``names`` [n].
+    - ``.npz``: one array [N] per muscle with its name, or one array [N, n] and ``names`` [n].
     - ``.npy``: an array [N, n], or [N] with named fields.
 
-    Muscles without names are ``muscle_0`` and so on. No code in a file is run.
+    Muscles without names are called ``muscle_0`` and so on. No code in a file is executed.
 
     Args:
         path (path-like): the file.
 
     Keyword Args:
-        trial (str, optional): the column (or array [N]) that says which trial a row belongs to.
+        trial (str, optional): the column (or array [N]) with the trial of each row.
             Default: ``"trial"``, if there is one.
-        leave_out (sequence of str): columns that are not muscles, such as the time.
+        leave_out (sequence of str): columns that are not muscles, such as time.
 
     Returns:
-        Recording: its numbers are finite, and every muscle varies.
+        Recording: all numbers are finite, and every muscle varies.
 
     Raises:
         OSError: if the file cannot be read.
-        ValueError: if it is of another kind, has rows of different lengths, missing values, decimal
-            commas, a muscle that never varies, or names twice or not at all. Rows are told by the
-            line of a ``.csv`` file, by their index from 0 in an array.
+        ValueError: for another file type, rows of different lengths, missing values, decimal
+            commas, a muscle that never varies, or duplicate or missing names. Messages give the
+            line in a ``.csv`` file, or the row index from 0 in an array.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -104,7 +104,7 @@ def read_recording(
 
 
 Columns = list[tuple[str, "np.ndarray | list[str]"]]
-# The line of the file that each row begins on; arrays have none.
+# The line of the file on which each row begins; ``None`` for arrays.
 Lines = list[int] | None
 
 
@@ -137,8 +137,8 @@ def _read_csv(path: Path) -> tuple[Columns, Lines]:
 
 
 def _rows(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[str]]]:
-    """The rows of a table, each with the line that it begins on, from 1 up."""
-    # Strict, or a quotation mark without a second one swallows the rest of the file.
+    """The rows of a table, each with the line on which it begins, counted from 1."""
+    # Without strict, an unclosed quotation mark would swallow the rest of the file.
     reader = csv.reader(lines, delimiter=delimiter, strict=True)
     rows, first = [], 1
     try:
@@ -211,7 +211,7 @@ def _columns(path: Path, array: np.ndarray, names: np.ndarray | None = None) -> 
 
 
 def _numbers(path: Path, name: str, column: np.ndarray | list[str], lines: Lines) -> np.ndarray:
-    """A column in double precision; what is missing is NaN."""
+    """A column in double precision, with NaN for missing values."""
     if isinstance(column, list):
         column = ["nan" if entry.lower() in _MISSING else entry for entry in column]
         wrong = next((i for i, entry in enumerate(column) if not _is_number(entry)), None)
@@ -243,7 +243,7 @@ def _is_number(text: str) -> bool:
 
 
 def _leave_out(*names: str) -> str:
-    """The setting as a shell takes it: what is more than a word needs quotation marks."""
+    """The setting in shell syntax, quoted if a name contains special characters."""
     if all(re.fullmatch(r"\w+", name) for name in names):
         return f"leave_out=[{','.join(names)}]"
     listed = ",".join(f"'{name}'" for name in names)
@@ -251,7 +251,7 @@ def _leave_out(*names: str) -> str:
 
 
 def _place(lines: Lines, row: int) -> str:
-    """Where a person finds a row."""
+    """Location of a row for an error message."""
     return f"row {row}" if lines is None else f"line {lines[row]}"
 
 

@@ -1,4 +1,4 @@
-"""Synergies as SAR finds them: principal components turned into independent ones (Berg 2023)."""
+"""Synergies of SAR: principal, then independent components (Berg 2023)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ __all__ = ["SARSynergies", "independent_components"]
 
 
 class SARSynergies(AffineSynergies):
-    """The mean action and d directions whose coefficients are as independent as can be.
+    """The mean action and d directions with maximally independent coefficients.
 
-    The model is a = mean + c·basis. SAR's own method, with its play phase and its blend, is
+    The model is a = mean + c·basis. The complete method, with play phase and blend, is
     :class:`~torchrl_etl.methods.SAR`.
 
-    Deviates: SAR's map ends at the bounds in a clamp, beyond which nothing has a gradient, spans
-    all coefficients that were seen, and blends in a raw action. Here it is the decoder of every
-    affine kind: it bends where a muscle nears its bounds, spans the 1st to the 99th percentile,
-    and adds a residual before the bounds, whose entropy is corrected.
+    Deviates: SAR's map clamps actions to the bounds, where gradients vanish, spans all observed
+    coefficients, and blends in a raw action. Here the decoder is that of every affine kind: it
+    saturates smoothly near the bounds, spans the 1st to the 99th percentile of coefficients, and
+    adds a residual before the bounds, with an entropy correction.
 
     Keyword Args:
-        max_iter (int): iterations of the search for independent components at most.
-        seed (int): of that search.
+        max_iter (int): maximum number of ICA iterations.
+        seed (int): seed of PCA and ICA.
 
     Examples:
         >>> _ = torch.manual_seed(0)
@@ -66,10 +66,10 @@ class SARSynergies(AffineSynergies):
 def independent_components(
     actions: np.ndarray, count: int, *, seed: int = 0, max_iter: int = 1000
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean [n] of actions [N, n], and the basis [count, n] of coefficients of unit variance.
+    """Mean [n] of actions [N, n] in double precision, and a basis [count, n] from PCA and ICA.
 
-    Principal components first, among which independent ones are then searched for; those along
-    which the actions do not vary stay as they are. The actions are in double precision.
+    ICA turns the principal components that vary, if at least two, into independent components with
+    coefficients of unit variance. Other principal components are kept unchanged.
     """
     pca = principal_components(actions, count, random_state=seed)
     basis, mean = pca.components_.copy(), pca.mean_
@@ -79,7 +79,7 @@ def independent_components(
         from sklearn.decomposition import FastICA
 
         ica = FastICA(whiten="unit-variance", max_iter=max_iter, random_state=seed)
-        with unfinished():  # among components alike in shape, as Gaussian ones, any turn is as good
+        with unfinished():  # any rotation is as good among Gaussian components
             ica.fit(pca.transform(actions)[:, :varying])
         mean = mean + ica.mean_ @ basis[:varying]
         basis[:varying] = ica.mixing_.T @ basis[:varying]

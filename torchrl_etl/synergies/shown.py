@@ -1,4 +1,4 @@
-"""Which actions of a batch a synergy model sees."""
+"""Select the actions of a batch on which a synergy model is trained."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Actions = Literal["policy", "mean", "sampled", "activation"]
 
 
 class ShownActions:
-    """Picks the actions that a synergy model is trained on out of a batch of transitions.
+    """Selects from a batch of transitions the actions on which a synergy model is trained.
 
     Deviates: Algorithm 1 has "collected action data". Actions sampled from a maximum-entropy policy
-    are nearly white noise, which few synergies cannot explain, so the mean action of the policy as
-    it is (``"policy"``) is the default; ``"sampled"`` is the print.
+    are nearly white noise, which few synergies cannot explain. The default is therefore the current
+    policy's mean action (``"policy"``); ``"sampled"`` is as printed.
 
     Args:
         actor (ProbabilisticTensorDictSequential): the policy.
 
     Keyword Args:
-        actions (str): ``"policy"``: its mean actions as it is now; ``"mean"``: as it was when it
-            acted; ``"sampled"``: what was done; ``"activation"``: muscle activations in units of
-            the action.
-        best_share (float): share of a batch, by reward, that is shown.
+        actions (str): ``"policy"``: mean actions of the current policy; ``"mean"``: mean actions of
+            the policy that collected them; ``"sampled"``: executed actions; ``"activation"``:
+            muscle activations in action units.
+        best_share (float): fraction of a batch to select, by highest reward. Default: 1.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class ShownActions:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """A tensordict of ``action`` [*, n]."""
+        """A tensordict with the selected ``action`` [*, n]."""
         actions = self._of(batch)
         if self.best_share < 1:
             count = max(1, round(self.best_share * len(actions)))

@@ -12,12 +12,12 @@ __all__ = ["VAESynergies"]
 
 
 class VAESynergies(GMVAESynergies):
-    """A GMVAE with one component, whose prior is one Gaussian.
+    """A GMVAE with one component, so its prior is a single Gaussian.
 
     Args:
         low, high (Tensor): bounds of the action [n].
         num_synergies (int): d.
-        **options: those of :class:`~torchrl_etl.synergies.GMVAESynergies` but ``num_components``.
+        **options: see :class:`~torchrl_etl.synergies.GMVAESynergies`, except ``num_components``.
     """
 
     kind = "vae"
