@@ -113,7 +113,7 @@ class Method(ABC):
         self.stage()
 
     def of_the_body(self, option: float | Mapping[str, float]) -> float:
-        """An option's value; if it has one for ``legs`` and one for ``hands``, that for this body.
+        """Resolve an option that may have separate values for ``legs`` and ``hands``.
 
         Bodies with a floating root count as legs.
         """

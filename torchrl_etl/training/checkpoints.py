@@ -129,7 +129,7 @@ def _digests(folder: Path, *, flush: bool = False) -> dict[str, str]:
 
 
 def _fault(folder: Path) -> str | None:
-    """What is wrong with a checkpoint folder, or None."""
+    """The defect of a checkpoint folder, or ``None``."""
     try:
         sealed = json.loads((folder / _SEAL).read_text(encoding="utf-8"))
         found = _digests(folder)

@@ -118,7 +118,7 @@ def _stored(path: Path) -> DictConfig:
 
 
 def _lacks(config: Any) -> str | None:
-    """What this configuration lacks that every run's has, or ``None``."""
+    """The required settings that this configuration lacks, as text, or ``None``."""
     if not isinstance(config, DictConfig):
         return "it holds no settings"
     plain = OmegaConf.to_container(config)

@@ -85,7 +85,7 @@ class Stage:
         transforms (sequence of Transform): applied to rows sampled for many updates at once;
             transforms that depend on current weights belong to the learner instead.
         updated (SACLearner, optional): learner to update. Default: ``learner``.
-        prefill_size (int): room for prefilled transitions, besides the budget. Default: 0.
+        prefill_size (int): transitions to allocate for a prefill, on top of the budget. Default: 0.
         action_repeat (int): frames per transition. Default: 1.
         restart_seed (int): change it to collect other episodes with the same ``seed``, for example
             to resume a run whose simulation diverged. Default: 0.
