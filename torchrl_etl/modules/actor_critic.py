@@ -23,10 +23,10 @@ Body = Literal["mlp", "residual", "residual_bfloat16"]
 
 
 class _Layers(nn.Sequential):
-    """Layers whose first, a linear one, reads several inputs that are never joined.
+    """Layers whose first, linear layer takes several inputs without concatenating them.
 
-    Hence no gradient is computed for an input that needs none: under the actor loss the critics'
-    inputs are the action, whose gradient is wanted, and the observation, whose is not.
+    This skips the gradient of inputs that need none: the actor loss needs the critics' gradient
+    with respect to the action, not the observation.
     """
 
     def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
@@ -41,9 +41,9 @@ class _Layers(nn.Sequential):
 
 
 class _ResidualBlock(nn.Sequential):
-    """x + W₂ relu(W₁ norm(x)), four times as wide inside (Lee 2024, SimBa).
+    """x + W₂ relu(W₁ norm(x)) with hidden width 4·width (SimBa, Lee 2024).
 
-    With ``bfloat16`` its products are of that precision; weights, sum and gradients are not.
+    With ``bfloat16`` matrix products run in bfloat16; weights, their gradients and the sum do not.
     """
 
     def __init__(self, width: int, layer_norm: bool, bfloat16: bool) -> None:
@@ -52,14 +52,14 @@ class _ResidualBlock(nn.Sequential):
         self.bfloat16 = bfloat16
 
     def forward(self, hidden: Tensor) -> Tensor:
-        if not self.bfloat16:  # as whoever calls it has it
+        if not self.bfloat16:  # the caller's autocast state
             return hidden + super().forward(hidden)
         with torch.autocast(hidden.device.type, torch.bfloat16):
             return hidden + super().forward(hidden)
 
 
 class _QuietTail(nn.Module):
-    """Gives the last entries of a Gaussian one fixed standard deviation."""
+    """Fixes the standard deviation of a Gaussian's last ``count`` entries."""
 
     def __init__(self, count: int, std: float) -> None:
         check_integer(1, quiet=count)
@@ -76,7 +76,7 @@ class _QuietTail(nn.Module):
 def make_layers(
     in_features: int, out_features: int, body: Body, hidden: Sequence[int], layer_norm: bool
 ) -> nn.Sequential:
-    """The layers of an actor or a critic; called with as many tensors as it has inputs."""
+    """Layers of an actor or critic, to be called with one tensor per input."""
     check_choice("body", body, get_args(Body))
     check_sizes(hidden=hidden)
     check_flag(layer_norm=layer_norm)
@@ -114,7 +114,7 @@ def make_actor(
     quiet: int = 0,
     quiet_std: float = 0.05,
 ) -> ProbabilisticActor:
-    """Tanh-Gaussian actor whose samples fill the bounds of ``action_spec``.
+    """Tanh-Gaussian actor scaled to the bounds of ``action_spec``.
 
     Args:
         inputs (mapping of NestedKey to int): keys that the actor reads, with their sizes; several
@@ -122,14 +122,14 @@ def make_actor(
         action_spec (TensorSpec): one unbatched bounded leaf.
 
     Keyword Args:
-        out_key (NestedKey): where the sample goes. Default: ``"action"``.
-        body (str): ``"mlp"``; ``"residual"``, blocks that each add to what came before; or
-            ``"residual_bfloat16"``, whose products inside blocks are of that precision: two thirds
-            of the time on processors with instructions for it, slower on others.
+        out_key (NestedKey): key of the sample. Default: ``"action"``.
+        body (str): ``"mlp"``; ``"residual"``, residual blocks; or ``"residual_bfloat16"``, the same
+            with matrix products inside blocks in bfloat16. These take two thirds of the time on
+            processors with bfloat16 instructions, and longer on others.
         hidden (sequence of int): widths of the hidden layers, or of the residual blocks.
-        layer_norm (bool): normalise each hidden layer, or what enters each block.
-        quiet (int): so many of the last entries have a fixed standard deviation before the tanh,
-            ``quiet_std``; the others' is learned. Default: 0.
+        layer_norm (bool): normalize each hidden layer, or the inputs of residual blocks and head.
+        quiet (int): number of last entries whose standard deviation before the tanh is fixed at
+            ``quiet_std``, not learned. Default: 0.
 
     Keys:
         reads ``inputs``; writes ``loc``, ``scale`` [*, n] (before the tanh) and ``out_key`` [*, n].
@@ -153,10 +153,10 @@ def make_actor(
 
 
 def start_small(layers: nn.Sequential) -> None:
-    """Let an actor's means start near the middle of the bounds.
+    """Initialize an actor's means near the middle of the bounds.
 
-    Whatever they later vary in was then learned: in stage 1 the GMVAE would otherwise fit the
-    noise of the initialisation.
+    All later variation is then learned; otherwise the GMVAE of stage 1 would fit the random
+    initialization.
     """
     with torch.no_grad():
         layers[-1].weight.mul_(0.01)
@@ -172,10 +172,10 @@ def actor_with(
     out_key: NestedKey,
     **kwargs: Any,
 ) -> ProbabilisticActor:
-    """An actor that samples from a distribution within the bounds of ``action_spec``.
+    """Actor that samples from a distribution within the bounds of ``action_spec``.
 
-    The distribution is built from the parameters, which the network makes of the inputs, ``low``,
-    ``high`` and ``kwargs``.
+    The distribution takes the network's outputs (``parameters``), ``low`` and ``high`` of the spec,
+    and ``kwargs``.
     """
     low, high = bounds_of(action_spec)
     return ProbabilisticActor(
@@ -204,8 +204,8 @@ def make_critic(
 
     Keyword Args:
         body, hidden, layer_norm: as in :func:`make_actor`.
-        bins (int): above one, the output is the logits of a categorical distribution of the
-            return; see ``support`` of :class:`~torchrl_etl.objectives.LeanSACLoss`. Default: 1.
+        bins (int): number of outputs; several are logits of a categorical return distribution. See
+            ``support`` of :class:`~torchrl_etl.objectives.LeanSACLoss`. Default: 1.
 
     Examples:
         >>> import torch
@@ -216,7 +216,7 @@ def make_critic(
         torch.Size([3, 1])
     """
     check_integer(1, bins=bins)
-    # Named here: ValueOperator calls it a state value unless a key is literally "action".
+    # ValueOperator would name the output a state value unless a key is literally "action".
     return ValueOperator(
         make_layers(sum(inputs.values()), bins, body, hidden, layer_norm),
         in_keys=list(inputs),

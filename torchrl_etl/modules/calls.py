@@ -1,4 +1,4 @@
-"""What a TensorDictModule does beside calling its module."""
+"""Detects TensorDictModules that only call their module."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ __all__ = ["calls_module_only"]
 
 
 def calls_module_only(network: TensorDictModule) -> bool:
-    """Whether a network hands entries to its module by position, and does no more.
+    """Whether a network only passes entries to its module by position.
 
-    Its module can then be called without the tensordict around it, at a fraction of the time.
+    The module can then be called on tensors directly, in a fraction of the time.
     """
     return (
         type(network).forward is TensorDictModule.forward
         and isinstance(network.module, nn.Module)
-        and network._kwargs is None  # names of inputs by keyword
+        and network._kwargs is None  # inputs passed by keyword
         and network.method is None
         and not network.method_kwargs
         and not network._forward_hooks

@@ -1,4 +1,4 @@
-"""Bounds that a parameter can come back from."""
+"""Clamp that lets a parameter return from its bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Clamp"]
 
 
 class Clamp(torch.autograd.Function):
-    """``value.clamp(low, high)`` whose gradient still passes where it leads back inside.
+    """``value.clamp(low, high)`` that keeps the gradient where descent leads back inside.
 
     Examples:
         >>> value = torch.tensor([-1.0, 0.5, 2.0], requires_grad=True)
@@ -20,7 +20,7 @@ class Clamp(torch.autograd.Function):
         tensor([0., 1., 1.])
     """
 
-    generate_vmap_rule = True  # both ways are made of operations that torch.vmap knows
+    generate_vmap_rule = True  # forward and backward use only operations that torch.vmap supports
 
     @staticmethod
     def forward(value: Tensor, low: float, high: float) -> Tensor:

@@ -71,7 +71,7 @@ class ActionDecoder(nn.Module):
         return self.denormalize(self.unit(latent))
 
     def unit(self, latent: Tensor) -> Tensor:
-        """The action where its bounds are [-1, 1]."""
+        """Actions [*, n] in units where the bounds are [-1, 1]."""
         return torch.tanh(self.mlp(latent))
 
     def normalize(self, action: Tensor) -> Tensor:
@@ -142,15 +142,15 @@ class GMVAE(nn.Module):
             )
         self.latent_dim, self.action_dim = latent_dim, action_dim
         self.num_components = num_components
-        # One head emits every component's logits, means and scales: with few components the
-        # exact expectation of Eq. 9 costs one pass.
+        # One head outputs all components' logits, means and scales: the exact expectation of
+        # Eq. 9 costs one pass.
         self.encoder = MLP(
             action_dim,
             num_components * (1 + 2 * latent_dim),
             num_cells=list(hidden),
             activation_class=nn.ELU,
         )
-        # Means start apart so that the components have something to divide between them.
+        # Means start apart, so that components can specialize.
         self.prior_loc = nn.Parameter(
             torch.randn(num_components, latent_dim)
             if num_components > 1
@@ -221,8 +221,8 @@ class GMVAE(nn.Module):
     def likelihood_scale(self) -> Tensor:
         """s [n], in units where the action bounds are [-1, 1].
 
-        Bounded below: on actions that d latents explain exactly the likelihood has no maximum. A
-        scale at its bound can grow again when the actions get more varied, as they do in stage 1.
+        Bounded below, since the likelihood has no maximum if d latents explain the actions exactly.
+        A scale at its bound can grow again as actions become more varied, which happens in stage 1.
         """
         return Clamp.apply(self.likelihood_log_scale, -4.0, math.inf).exp()
 
@@ -246,7 +246,7 @@ class GMVAE(nn.Module):
     def infer(self, action: Tensor | np.ndarray) -> Tensor:
         """Posterior mean E[z|a] [*, d] of recorded actions, under the likeliest component.
 
-        The mean over components can fall between two modes, where no action lives.
+        A mean over components could fall between two modes, where there are no actions.
         """
         if not isinstance(action, Tensor):
             action = as_actions(action, low=self.low, high=self.high)
@@ -255,5 +255,5 @@ class GMVAE(nn.Module):
         return posterior.loc.take_along_dim(best, -2).squeeze(-2)
 
     def reconstruct(self, action: Tensor | np.ndarray) -> Tensor:
-        """Actions [*, n] through the posterior mean and back."""
+        """Actions [*, n] decoded from their posterior means."""
         return self.decode(self.infer(action))

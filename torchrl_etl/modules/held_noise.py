@@ -1,4 +1,4 @@
-"""Exploration noise that lasts."""
+"""Exploration noise that is held over several steps."""
 
 from __future__ import annotations
 
@@ -14,29 +14,27 @@ __all__ = ["HeldNoise"]
 
 
 class HeldNoise(TensorDictModuleBase):
-    """An actor whose noise is held for several steps: it moves a body where white noise shakes it.
+    """Actor that holds its noise for several steps, which moves a body more than white noise does.
 
-    The action is that of the actor's own distribution, with its standard normal variable as
-    :class:`~torchrl_etl.modules.lasting_noise.HeldNormal` draws it. Each step's action is
-    distributed as before; only the correlation over time is new, and off-policy learners need not
-    know of it.
+    It samples the actor's own distribution, with the standard normal noise of
+    :class:`~torchrl_etl.modules.lasting_noise.HeldNormal`. The distribution of each step's action
+    is unchanged; only the correlation over time is new. Off-policy learners need no change.
 
-    The noise is this module's own, by row of the batch: it must be called with the same simulators
-    in the same order, as a collector does. Under any other exploration type than random it is the
-    actor itself.
+    The noise is kept per row of the batch. Every call must have the same simulators in the same
+    order, as in a collector. Under an exploration type other than random the actor runs unchanged.
 
     Args:
-        actor (ProbabilisticTensorDictSequential): with a ``TanhNormal``, as of
+        actor (ProbabilisticTensorDictSequential): actor with a ``TanhNormal``, such as from
             :func:`~torchrl_etl.modules.make_actor`.
 
     Keyword Args:
-        exponent (float): above 0; the larger, the shorter. Default: 2.
-        longest (int): most steps. Default: 16.
+        exponent (float): exponent of the hold lengths, above 0; larger is shorter. Default: 2.
+        longest (int): longest hold, in steps. Default: 16.
         init_key (NestedKey): see :class:`torchrl.envs.InitTracker`. Default: ``"is_init"``.
 
     Keys:
-        reads the actor's, and ``is_init`` [*, 1], where noise is drawn anew; writes the actor's,
-        but for a log-probability.
+        reads the actor's in-keys and ``is_init`` [*, 1], where noise is redrawn; writes the actor's
+        out-keys, except for a log-probability.
 
     Raises:
         ValueError: if exponent or longest are not positive, or the actor is no tanh-Gaussian.
@@ -61,7 +59,7 @@ class HeldNoise(TensorDictModuleBase):
         init_key: NestedKey = "is_init",
     ) -> None:
         kind = actor[-1].distribution_class
-        kind = getattr(kind, "func", kind)  # of a partial
+        kind = getattr(kind, "func", kind)  # unwraps a partial
         if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
             raise ValueError(
                 f"The actor draws from {getattr(kind, '__name__', kind)}; noise is held in a "

@@ -1,8 +1,8 @@
-"""Standard normal noise that lasts: each step's is as drawn anew, only correlated with the others.
+"""Standard normal noise that is correlated over time.
 
-A drawing is called once a step with the simulators in the same order, and draws for all of them
-every time, so that random numbers do not depend on which are used. Where an episode begins, nothing
-is left of the one before.
+Call an instance once per step, with the simulators in the same order. Each call draws numbers for
+all of them, so the random stream does not depend on which are used. Noise starts anew with each
+episode.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ __all__ = ["HeldNormal", "PinkNormal"]
 
 
 class HeldNormal:
-    """Drawn once and kept for k steps, P(k) ∝ k^-exponent, k ≤ longest (FlashSAC, 2026).
+    """Noise drawn once and held for k steps, P(k) ∝ k^-exponent, k ≤ longest (FlashSAC, 2026).
 
     Args:
-        longest (int): most steps.
-        exponent (float): above 0; the larger, the shorter. Default: 2.
+        longest (int): longest hold, in steps.
+        exponent (float): above 0; larger is shorter. Default: 2.
 
     Raises:
         ValueError: if exponent or longest are not positive.
@@ -41,8 +41,8 @@ class HeldNormal:
         self._left: Tensor | None = None
 
     def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
-        """The noise [*, n] of this step, of the dtype of ``like``; ``begins`` [*] says where an
-        episode begins."""
+        """Noise [*, n] of this step in the dtype of ``like``; ``begins`` [*] marks where an episode
+        begins."""
         if self._noise is None or self._noise.shape != like.shape:
             self._noise = torch.zeros_like(like)
             self._left = torch.zeros_like(begins, dtype=torch.long)
@@ -55,17 +55,17 @@ class HeldNormal:
 
 
 class PinkNormal:
-    """Its power falls as 1 / frequency: the mean of processes whose time constants double.
+    """Pink noise, power ∝ 1 / frequency: a sum of processes whose time constants double.
 
-    The processes are autoregressive of first order and in their stationary distribution from the
-    first step of an episode on. Up to the longest, power times frequency stays within a factor of
-    1.7, for which others draw whole episodes by Fourier transforms (Eberhard 2023).
+    The processes are first-order autoregressive and start each episode in their stationary
+    distribution. Up to the longest time constant, power times frequency stays within a factor of
+    1.7. Others draw whole episodes by Fourier transforms instead (Eberhard 2023).
 
     Equation: x_t = Σ_i y_i,t / √K with y_i,t+1 = a_i y_i,t + √(1 - a_i²) ε, a_i = exp(-2^-i) for i
     from 0 to K - 1, so that the correlation over k steps is the mean of a_i^k.
 
     Args:
-        longest (int): time constant of the slowest process in steps, brought down to a power of 2.
+        longest (int): time constant of the slowest process in steps, rounded down to a power of 2.
 
     Raises:
         ValueError: if longest is not positive.
@@ -83,7 +83,7 @@ class PinkNormal:
         self._parts: Tensor | None = None
 
     def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
-        """The noise of this step, see :class:`HeldNormal`."""
+        """Noise of this step, see :class:`HeldNormal`."""
         kept = self._kept.to(like).view(-1, *[1] * like.ndim)
         drawn = torch.randn((len(kept), *like.shape), dtype=like.dtype, device=like.device)
         if self._parts is None or self._parts.shape != drawn.shape:

@@ -1,4 +1,4 @@
-"""A policy as whoever knows neither TensorDict nor TorchRL calls it."""
+"""Calls a policy without TensorDict or TorchRL."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ def policy_function(
     observation_key: NestedKey = "observation",
     action_key: NestedKey = "action",
 ) -> Callable[[ArrayLike], np.ndarray]:
-    """A deterministic function of an observation: NumPy in, NumPy out.
+    """Wrap a policy as a deterministic function from NumPy observations to NumPy actions.
 
-    The policy is held by reference: it may go on learning.
+    The policy is held by reference: the function follows its training.
 
     Args:
-        policy (TensorDictModuleBase): reads one key, and writes the action among others.
+        policy (TensorDictModuleBase): reads one key and writes the action, perhaps among others.
 
     Keyword Args:
-        observation_key, action_key (NestedKey): what it reads, and what is wanted of it: with
-            ``"synergy"`` the coefficients of a policy that acts through a decoder.
+        observation_key, action_key (NestedKey): the policy's input, and the output to return.
+            ``"synergy"`` returns the coefficients of a policy that acts through a decoder.
 
     Returns:
-        callable: from an observation [*, O] to an action [*, n] in single precision.
+        callable: maps an observation [*, O] to an action [*, n] in single precision.
 
     Raises:
-        ValueError: if the policy does not read that key alone, or does not write the other.
+        ValueError: if the policy reads any other key, or does not write ``action_key``.
 
     Examples:
         >>> from torchrl.data import Bounded

@@ -1,4 +1,4 @@
-"""Arrays of recorded actions and their bounds, as files and NumPy hold them, made fit to use."""
+"""Checks and converts recorded actions and action bounds."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ OVERSHOOT = 0.1
 def as_actions(
     actions: Tensor | np.ndarray | Sequence[Any], *, low: Tensor, high: Tensor, min_rows: int = 0
 ) -> Tensor:
-    """Recorded actions as a tensor of the dtype and on the device of the bounds.
+    """Convert recorded actions to a tensor with the dtype and device of the bounds.
 
-    Integers, double precision, NumPy arrays and lists are converted.
+    Integers, double precision, NumPy arrays and lists are accepted.
 
     Args:
         actions (array): [*, n], in action units.
 
     Keyword Args:
-        low, high (Tensor): action bounds [n]. Values may pass them by a tenth of the range.
-        min_rows (int): with more than 0, ``actions`` must have that many rows, and is returned as
-            [N, n], with a warning if all are alike. Default: 0.
+        low, high (Tensor): action bounds [n]. Values may exceed them by a tenth of the range.
+        min_rows (int): if above 0, require this many rows, return [N, n], and warn if all rows
+            are equal. Default: 0.
 
     Raises:
         TypeError: if the actions are not real numbers.
-        ValueError: if the last size is not n, a value is not finite or far outside of the bounds,
-            or rows are too few.
+        ValueError: if the last size is not n, a value is masked, not finite or far outside the
+            bounds, or there are too few rows.
 
     Examples:
         >>> import numpy as np
@@ -82,7 +82,7 @@ def as_actions(
 
 
 def as_bounds(low: Any, high: Any, action_dim: int) -> tuple[Tensor, Tensor]:
-    """Both action bounds as [n], in single precision, each a copy.
+    """Copies of both action bounds, [n] each, in single precision.
 
     Args:
         low, high (float, sequence of float or Tensor): one number, or one for each actuator.
@@ -114,10 +114,10 @@ def as_bounds(low: Any, high: Any, action_dim: int) -> tuple[Tensor, Tensor]:
 
 
 def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """Both bounds of a ``Bounded`` leaf; an ``Unbounded`` one has the largest numbers as such.
+    """Lower and upper bounds of a ``Bounded`` leaf.
 
     Raises:
-        ValueError: if the spec is another, or its range is not finite.
+        ValueError: if the spec is not ``Bounded``, or its range is not finite.
     """
     if isinstance(action_spec, Bounded):
         low, high = action_spec.space.low, action_spec.space.high
@@ -134,7 +134,7 @@ def _from_array(actions: np.ndarray | Sequence[Any]) -> Tensor:
     array = np.asarray(actions)
     if array.dtype.kind not in "biuf":
         raise TypeError(f"Its dtype is {array.dtype}.")
-    # A copy: torch has neither negative strides nor other byte orders nor more digits.
+    # Copy: torch has no negative strides, foreign byte orders or extended precision.
     return torch.from_numpy(np.array(array, np.float64, order="C"))
 
 

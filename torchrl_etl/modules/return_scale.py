@@ -1,4 +1,4 @@
-"""Rewards in units of the returns that they add up to."""
+"""Scaling of rewards by the size of their returns."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["ReturnScale"]
 
 
 class ReturnScale(RunningMoments):
-    """Divides rewards so that returns deviate by about one and stay within a bound.
+    """Divides rewards so that returns have a deviation of about one and stay within a bound.
 
-    Per episode it follows the discounted sum of the rewards so far, G_t = r_t + γ G_{t-1}, zero
-    where it begins. The scale is max(std(G), max|G| / bound) over all that was seen.
+    Each episode accumulates its past rewards, G_t = r_t + γ G_{t-1}, starting from zero. The scale
+    is max(std(G), max|G| / bound) over all data seen.
 
-    Equation: the reward scaling of FlashSAC (2026); the first term is that of Engstrom 2020.
+    Equation: the reward scaling of FlashSAC (2026); its first term is from Engstrom 2020.
 
     Args:
         gamma (float): discount factor γ in [0, 1).
@@ -46,18 +46,18 @@ class ReturnScale(RunningMoments):
         self.forget()
 
     def forget(self) -> None:
-        """All episodes begin anew; what was seen of earlier ones stays in the scale."""
+        """Start all episodes anew; the scale keeps its statistics."""
         self._sums: dict[int, float] = {}
 
     @torch.no_grad()
     def update(self, reward: Tensor, done: Tensor, episode: Tensor | None = None) -> None:
-        """See a batch [simulators, time].
+        """Update the statistics with a batch.
 
         Args:
             reward, done (Tensor): of each step, [simulators, time].
-            episode (Tensor, optional): a number for the episode of each step, [simulators, time],
-                by which the next batch that holds it goes on with its sum, whichever simulators
-                are in between. Default: all batches have the same simulators in the same order.
+            episode (Tensor, optional): episode number of each step, [simulators, time]. A later
+                batch with the same number continues its sum, whichever batches come between.
+                Default: all batches have the same simulators in the same order.
         """
         reward = reward.to(self.mean)
         if episode is None:
@@ -75,7 +75,7 @@ class ReturnScale(RunningMoments):
 
     @property
     def scale(self) -> Tensor:
-        """What rewards are divided by; one before anything was seen."""
+        """Divisor of the rewards; one before any data."""
         scale = torch.maximum(self.variance.sqrt(), self.largest / self.bound)
         return torch.where(scale > 1e-8, scale, 1.0)
 

@@ -1,4 +1,4 @@
-"""Mean and deviation of a scalar that drifts."""
+"""Running mean and standard deviation of a drifting scalar."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ __all__ = ["RunningDeviation"]
 
 
 class RunningDeviation(nn.Module):
-    """Exponentially weighted mean and variance of a scalar, free of start-up bias.
-
-    Weights are those of a bias-corrected moving average: the first update counts fully.
+    """Bias-corrected EMA of a scalar's mean and variance; the first update has full weight.
 
     Args:
-        decay (float): in (0, 1); an update weighs ``1 - decay``.
+        decay (float): in (0, 1); an update has weight ``1 - decay``.
 
     Examples:
         >>> import torch
@@ -27,7 +25,7 @@ class RunningDeviation(nn.Module):
         tensor(2.)
     """
 
-    # What hardly varies is scaled up to ten times its root mean square, not to infinity.
+    # Keeps the root mean square of divided values at 10 or less when they hardly vary.
     _FLOOR = 0.1
     _EPSILON = 1e-6
 
@@ -36,7 +34,7 @@ class RunningDeviation(nn.Module):
         check_real("(0, 1)", decay=decay)
         self.decay = decay
         self.register_buffer("mean", torch.zeros(()))
-        # Never averaged in (the first update has full weight): it makes an unused divisor 1.
+        # Only makes the divisor 1 before the first update, which has full weight.
         self.register_buffer("variance", torch.ones(()))
         self.register_buffer("weight", torch.zeros(()))
 
@@ -54,6 +52,6 @@ class RunningDeviation(nn.Module):
 
     @property
     def divisor(self) -> Tensor:
-        """The deviation, at least a tenth of the root mean square; 1 before the first update."""
+        """Standard deviation, at least a tenth of the root mean square; 1 before any update."""
         floor = self._FLOOR**2 * (self.variance + self.mean.square())
         return torch.maximum(self.variance, floor).sqrt().clamp_min(self._EPSILON)

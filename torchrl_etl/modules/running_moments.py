@@ -13,10 +13,10 @@ __all__ = ["RunningMoments"]
 
 
 class RunningMoments(nn.Module):
-    """Moments of the values seen, in double precision; buffers, so that they are saved and sent.
+    """Running mean and variance in double precision, in buffers that go with the state dict.
 
     Args:
-        shape (sequence of int): of one value. Default: a number.
+        shape (sequence of int): shape of one value. Default: a scalar.
 
     Examples:
         >>> import torch
@@ -34,13 +34,13 @@ class RunningMoments(nn.Module):
 
     @torch.no_grad()
     def see(self, values: Tensor) -> None:
-        """Take in values [*, *shape], perhaps none."""
+        """Update with values [*, *shape], possibly none."""
         if self.mean.ndim:
             check_width(self.mean.shape[-1], values=values)
         rows = values.reshape(-1, *self.mean.shape).to(self.mean)
         if not len(rows):
             return
-        # Chan's parallel variance: exact, whatever the batches are.
+        # Chan's parallel variance: exact for any batch sizes.
         count, mean = self.count + len(rows), rows.mean(0)
         shift = mean - self.mean
         self.squares += (rows - mean).square().sum(0)
@@ -50,5 +50,5 @@ class RunningMoments(nn.Module):
 
     @property
     def variance(self) -> Tensor:
-        """Of all that was seen; zero before."""
+        """Population variance of all values seen; zero before any."""
         return self.squares / self.count.clamp(min=1)

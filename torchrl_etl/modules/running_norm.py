@@ -1,4 +1,4 @@
-"""Observations in units of what was seen so far."""
+"""Normalization of observations by running statistics."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["RunningNorm"]
 class RunningNorm(RunningMoments):
     """(x - mean) / standard deviation of all observations seen, clipped.
 
-    Joint angles, small pose errors and muscle forces come in one observation; networks that see
-    them as they are follow the largest (Lee 2024, SimBa). The statistics are buffers, so that they
-    travel with a policy's weights, and only :meth:`see` changes them: a sampled batch is
-    normalized by the same numbers as a step in the environment.
+    Joint angles, small pose errors and muscle forces come in one observation; without normalization
+    the largest dominate (SimBa, Lee 2024). The statistics are buffers, so they travel with a
+    policy's weights. Only :meth:`see` changes them: sampled batches and environment steps are
+    normalized by the same numbers.
 
     Args:
-        size (int): entries of an observation.
+        size (int): size of an observation.
 
     Keyword Args:
-        clip (float): largest magnitude of an entry of the output. Default: 10.
+        clip (float): largest absolute value of the output. Default: 10.
 
     Raises:
         ValueError: if size or clip are not positive.
@@ -44,10 +44,10 @@ class RunningNorm(RunningMoments):
         self.clip = clip
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Observations [*, size] in standard deviations; as they are before any was seen."""
-        if not observation.is_floating_point():  # of whose dtype the mean would be
+        """Normalized observations [*, size]; only clipped before any were seen."""
+        if not observation.is_floating_point():  # or the mean would become an integer
             observation = observation.float()
-        # What never varied stays where it is, at zero, rather than being blown up.
+        # Entries that never varied are only centered, not blown up.
         std = torch.where(self.variance > 1e-12, self.variance, 1.0).sqrt()
         normalized = (observation - self.mean.to(observation)) / std.to(observation)
         return normalized.clamp(-self.clip, self.clip)

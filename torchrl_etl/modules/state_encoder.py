@@ -1,4 +1,4 @@
-"""The state encoder φ and the latent dynamics that one reading of Eq. 2 needs."""
+"""The state encoder φ, and latent dynamics for the Gaussian divergence of Eq. 2."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["GaussianDynamics", "StateEncoder"]
 
 
 class _Network(nn.Sequential):
-    """Takes observations of any dtype: MuJoCo's Gymnasium tasks observe in double precision."""
+    """Accepts any dtype of observation: Gymnasium's MuJoCo tasks use double precision."""
 
     def forward(self, observation: Tensor) -> Tensor:
         return super().forward(observation.to(self[0].weight.dtype))
@@ -24,8 +24,8 @@ class _Network(nn.Sequential):
 class StateEncoder(TensorDictModule):
     """State encoder φ: S → R^k whose distances are trained to be behavioral distances.
 
-    The input passes a layer norm after the first linear map, so observations in mixed units
-    (radians, metres, muscle forces) start with comparable influence.
+    A layer norm follows the first linear layer, so that the units of the observation (radians,
+    metres, muscle forces) do not set the scale of the features.
 
     Args:
         observation_dim (int): size O of the observation.
@@ -85,7 +85,7 @@ class _GaussianHead(nn.Module):
 
     def forward(self, embedding: Tensor) -> tuple[Tensor, Tensor]:
         step, raw_scale = self.mlp(embedding).chunk(2, -1)
-        # The next embedding is near the present one: the network only has to learn the step.
+        # The next embedding is near the present one, so predict only the step.
         return embedding + step, nn.functional.softplus(raw_scale) + 1e-4
 
 

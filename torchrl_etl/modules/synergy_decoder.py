@@ -1,4 +1,4 @@
-"""The part of the GMVAE that stage 2 keeps: synergy coefficients in, muscle actions out."""
+"""The decoder of stage 2, from synergy coefficients to muscle actions."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from torchrl_etl.modules.synergy_map import SynergyMap
 
 __all__ = ["SynergyDecoder", "percentile_box"]
 
-# Where synergies alone end: in single precision a tanh reaches 1, whence no residual leads back.
+# Bound on the synergies alone: in single precision tanh reaches 1, where a residual has no effect.
 INSIDE = 1.0 - 1e-6
-# Where the bounds are ±1: as far as a recorded muscle counts as inside of them.
+# Clamp of recorded actions before they are inverted, in units where the bounds are ±1.
 NEAREST = 0.99
 _MOST_ROWS = 100_000
 
 
 def percentile_box(coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """Middle and half width [d] of the 1st to the 99th percentile of coefficients [N, d].
+    """Center and half width [d] of the 1st to 99th percentile of coefficients [N, d].
 
     Examples:
         >>> percentile_box(torch.linspace(0, 4, 101)[:, None])
         (tensor([2.]), tensor([1.9600]))
     """
-    # torch.quantile takes 16 million numbers at most.
+    # torch.quantile accepts at most 16 million numbers.
     rows = coefficients[:: 1 + len(coefficients) // _MOST_ROWS]
     low, high = rows.quantile(rows.new_tensor([0.01, 0.99]), dim=0)
     return (high + low) / 2, (high - low) / 2
@@ -57,7 +57,7 @@ class _ScaledDecoder(nn.Module):
         return self.decoder.denormalize(tanh_sum(*self.summands(synergy)))
 
     def summands(self, synergy: Tensor) -> tuple[Tensor, Tensor]:
-        """What synergies and residual add to an action, [*, n] each, where bounds are [-1, 1]."""
+        """Contributions of synergies and residual, [*, n] each, where bounds are [-1, 1]."""
         synergy, residual = synergy.split([self.decoder.latent_dim, self.decoder.action_dim], -1)
         base = self.decoder.unit(self.center + self.scale * synergy)
         return INSIDE * base, self.residual * residual
@@ -66,13 +66,13 @@ class _ScaledDecoder(nn.Module):
 class SynergyDecoder(SynergyMap):
     """Decoder of synergy coefficients into muscle actions, in the policy's units.
 
-    A policy emits u ∈ [-1, 1]^d; the latent is center + scale·u, where center and scale come from
-    the GMVAE's aggregate posterior, so that the box covers the latents that real actions have.
+    A policy outputs u ∈ [-1, 1]^d and the latent is center + scale·u. :meth:`from_gmvae` fits
+    center and scale so that this box covers the latents of recorded actions.
 
-    With ``residual=ρ > 0`` the synergy key has d + n entries; the last n are a raw action in
-    [-1, 1]^n that moves each muscle, from the middle of its range by at most ρ of its half. It is
-    added before the bounds (:func:`~torchrl_etl.functional.tanh_sum`), so that with ρ = 1 every
-    action is within reach of all coefficients.
+    With ``residual=ρ > 0`` the synergy key has d + n entries. The last n are a raw action in
+    [-1, 1]^n that moves each muscle directly, by at most ρ times its half range from the middle.
+    It is added before the bounds (:func:`~torchrl_etl.functional.tanh_sum`), so with ρ = 1 every
+    action can be reached from any coefficients.
 
     Equation: a = Dec(z^a) of section 4.2.
 
@@ -93,9 +93,9 @@ class SynergyDecoder(SynergyMap):
         reads ``synergy`` [*, d] (or [*, d+n]) in [-1, 1]; writes ``action`` [*, n] in [low, high].
 
     Attributes:
-        encoder (GMVAE, optional): a frozen copy of the model that the decoder was made from, by
-            which it encodes. It is no submodule: nothing trains it, and it is in no state dict:
-            with the weights of another decoder goes ``carry(other.encoder)``.
+        encoder (GMVAE, optional): frozen copy of the model that the decoder was made from, used by
+            :meth:`encode`. It is not a submodule, so it is neither trained nor in the state dict.
+            With another decoder's weights, also call ``carry(other.encoder)``.
 
     Raises:
         ValueError: if a size is not positive or ρ is outside [0, 1].
@@ -139,13 +139,13 @@ class SynergyDecoder(SynergyMap):
         self.carry(None)
 
     def carry(self, encoder: GMVAE | None) -> None:
-        """Encode by a frozen copy of this model from now on."""
+        """Encode with a frozen copy of this model from now on."""
         if encoder is not None:
             encoder = deepcopy(encoder).requires_grad_(False)
         object.__setattr__(self, "encoder", encoder)  # not as a submodule
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SynergyDecoder:
-        if self.encoder is not None:  # follows to a device or dtype
+        if self.encoder is not None:  # moves to the same device and dtype
             self.encoder._apply(fn, recurse)
         return super()._apply(fn, recurse)
 
@@ -158,11 +158,11 @@ class SynergyDecoder(SynergyMap):
         residual: float = 0.0,
         **keys: Any,
     ) -> SynergyDecoder:
-        """Take over a copy of the GMVAE's decoder, and one of the GMVAE as :attr:`encoder`.
+        """Copy a GMVAE's decoder, and the GMVAE itself as :attr:`encoder`.
 
         Args:
-            gmvae (GMVAE): the fitted model; left as it is.
-            actions (array, optional): actions [N, n] it was fitted on, see
+            gmvae (GMVAE): the fitted model; not modified.
+            actions (array, optional): actions [N, n] that it was fitted on, see
                 :func:`~torchrl_etl.modules.recorded_actions.as_actions`. The box of coefficients
                 then spans the 1st to 99th percentile of their latents in each dimension; without
                 actions it spans two standard deviations of the mixture prior.
@@ -209,23 +209,23 @@ class SynergyDecoder(SynergyMap):
         residual: float = 0.0,
         **keys: Any,
     ) -> SynergyDecoder:
-        """An affine map, squashed into the bounds: a decoder without hidden layers.
+        """Affine map squashed into the bounds: a decoder without hidden layers.
 
-        Around its center it is linear, and it bends only where a muscle nears its bounds.
+        It is nearly linear around its center and saturates where a muscle nears its bounds.
 
-        Equation: a = tanh(x + u·X) where the bounds are [-1, 1], x and X so that Dec(0) is the
-        center and ∂Dec(u)/∂u at 0 the directions.
+        Equation: a = tanh(x + u·X) where the bounds are [-1, 1], with x and X such that Dec(0) is
+        the center and ∂Dec(u)/∂u at 0 the directions.
 
         Args:
-            center (Tensor): action [n] of coefficients 0, inside the bounds.
-            directions (Tensor): how far one unit of each coefficient moves it [d, n], in action
-                units.
+            center (Tensor): action [n] at zero coefficients, inside the bounds.
+            directions (Tensor): change of the action per unit of each coefficient [d, n], at the
+                center and in action units.
 
         Keyword Args:
             low, high, residual, in_keys, out_keys: see the class.
 
         Raises:
-            ValueError: if the shapes do not fit, or the center is not inside the bounds.
+            ValueError: if the shapes do not match, or the center is not inside the bounds.
 
         Examples:
             >>> import torch
@@ -264,16 +264,16 @@ class SynergyDecoder(SynergyMap):
 
     @property
     def is_affine(self) -> bool:
-        """Whether it is affine before the bounds, as one of :meth:`from_directions` is."""
+        """Whether it is affine before the bounds, as from :meth:`from_directions`."""
         return not self.module.decoder.hidden
 
     @torch.no_grad()
     def encode(self, action: Tensor | np.ndarray) -> Tensor:
-        """Coefficients [*, d] of actions [*, n], clamped to the box that a policy acts in.
+        """Coefficients [*, d] of actions [*, n], clamped to the policy's box [-1, 1]^d.
 
-        An affine map is inverted by least squares before the bounds, where a muscle at its bound
-        counts as 0.99 of the way there. Another decoder infers them with its :attr:`encoder`, also
-        after it was fine-tuned.
+        An affine decoder is inverted by least squares before the bounds, with actions clamped to
+        0.99 of their half range. Any other decoder uses its :attr:`encoder`, also after
+        fine-tuning.
 
         Raises:
             RuntimeError: if the decoder is not affine and has no encoder.

@@ -1,4 +1,4 @@
-"""What ETL asks of whatever turns synergy coefficients into muscle actions."""
+"""Interface of maps from synergy coefficients to muscle actions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ __all__ = ["SynergyMap"]
 
 
 class SynergyMap(TensorDictModule):
-    """What maps synergy coefficients in a box to muscle actions, whatever is inside.
+    """Base class of maps from bounded synergy coefficients to muscle actions.
 
-    All that ETL asks of a decoder: call it, and it decodes; :meth:`log_slope` corrects the entropy
-    of what the policy moves directly; :meth:`encode` relabels recorded actions.
+    Calling it decodes; :meth:`log_slope` corrects the policy's entropy for the residual;
+    :meth:`encode` relabels recorded actions.
 
     Attributes:
         num_synergies (int): number d of synergies.
         action_dim (int): number n of actuators.
-        residual (float): share of an actuator that the policy moves directly; 0: none.
+        residual (float): share of an actuator's range that the policy moves directly; 0: none.
         low, high (Tensor): bounds of the action [n].
     """
 
@@ -33,18 +33,18 @@ class SynergyMap(TensorDictModule):
 
     @abstractmethod
     def log_slope(self, synergy: Tensor) -> Tensor:
-        """How far the action moves with the residual: ln |det ∂a/∂r| [*] at ``synergy`` [*, d+n].
+        """ln |det ∂a/∂r| [*] of the action a by the residual r, at ``synergy`` [*, d+n].
 
-        Relative to where the synergies leave every muscle in the middle of its range; 0 without a
+        Relative to synergies that put every muscle in the middle of its range; 0 without a
         residual.
         """
 
     @abstractmethod
     def encode(self, action: Tensor | np.ndarray) -> Tensor:
-        """Coefficients in [-1, 1]^d that with a residual of zero come near to actions [*, n].
+        """Coefficients in [-1, 1]^d that approximate actions [*, n] with zero residual.
 
         Returns:
-            Tensor: [*, d], without gradients and without a residual.
+            Tensor: [*, d], without gradients or entries of a residual.
 
         Raises:
             TypeError, ValueError: see :func:`~torchrl_etl.modules.recorded_actions.as_actions`.
@@ -57,5 +57,5 @@ class SynergyMap(TensorDictModule):
 
     @property
     def synergy_spec(self) -> Bounded:
-        """What a policy may emit: [-1, 1] in each entry, unbatched."""
+        """Action spec of a policy: [-1, 1] in each entry, unbatched."""
         return Bounded(-1.0, 1.0, shape=(self.synergy_dim,), device=self.low.device)

@@ -16,17 +16,17 @@ __all__ = ["UniformWarmup"]
 
 
 class UniformWarmup(TensorDictModuleBase):
-    """Replaces a policy's actions by uniform ones for the first so many.
+    """Replaces a policy's first ``frames`` actions by uniform ones.
 
-    It goes behind the actor: ``TensorDictSequential(actor, UniformWarmup(action_spec, 10_000))``.
-    The ``init_random_frames`` of TorchRL's collectors draws what the *environment* takes and begins
-    again when a run is resumed; this draws what the *actor* emits (synergies too) and its count can
-    be set. The count is in neither the tensordict nor the ``state_dict()``: pushing weights to a
-    worker leaves it alone. Where exploration is not set to random, actions pass uncounted.
+    Put it after the actor: ``TensorDictSequential(actor, UniformWarmup(action_spec, 10_000))``.
+    ``init_random_frames`` of TorchRL's collectors draws *environment* actions and restarts when a
+    run is resumed. This draws from the *actor's* space (synergies too), and its count can be set.
+    The count is in neither the tensordict nor the ``state_dict()``, so new weights leave a worker's
+    count alone. Unless exploration is set to random, actions pass unchanged and uncounted.
 
     Args:
-        action_spec (Bounded): what the actor emits, unbatched.
-        frames (int): actions to replace, those of all rows counted.
+        action_spec (Bounded): the actor's output, unbatched.
+        frames (int): number of actions to replace, summed over all rows.
 
     Keyword Args:
         action_key (NestedKey): Default: ``"action"``.
@@ -52,7 +52,7 @@ class UniformWarmup(TensorDictModuleBase):
     """
 
     seen: int
-    """Actions so far. Set it to go on where another run ended."""
+    """Actions counted so far. Set it to resume a run."""
 
     def __init__(
         self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"

@@ -1,4 +1,4 @@
-"""Linear layers on the unit sphere."""
+"""Unit-norm rows of linear layers."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ __all__ = ["normalize_rows"]
 
 @torch.no_grad()
 def normalize_rows(weights: Iterable[Tensor]) -> None:
-    """Bring every row of these weights [*, out, in] back to unit length, in place.
+    """Rescale every row of these weights [*, out, in] to unit length, in place.
 
-    Done after every optimizer step, it keeps the learning rate in proportion to the weights, which
-    otherwise grow, and a tanh actor out of its flat ends (FlashSAC, 2026; Lyle 2024).
+    Weights that grow make the learning rate relatively smaller. Rescaling after every optimizer
+    step prevents that, and keeps a tanh actor from saturating (FlashSAC, 2026; Lyle 2024).
 
     Examples:
         >>> import torch
