@@ -23,11 +23,11 @@ _DISTANCES = {"l2": functional.l2_distance, "mico": functional.mico_distance}
 
 
 class BehavioralMetricLoss(LossModule):
-    r"""Loss that makes distances between state embeddings behavioral distances.
+    r"""Loss that trains distances between state embeddings to be behavioral distances.
 
-    Pairs of transitions are formed inside the batch. The distance of their embeddings is pulled to
-    their reward difference plus ``gamma`` times how far apart their futures are, and pairs that
-    the reward cannot tell apart are kept from collapsing.
+    It pairs transitions within the batch. The distance of their embeddings regresses to their
+    reward difference plus ``gamma`` times the divergence of their next states. A regularizer keeps
+    pairs with nearly equal rewards from collapsing.
 
     Equation: 6 (with 2, 3 and 5): ``loss_metric + loss_regularizer``.
 
@@ -39,29 +39,28 @@ class BehavioralMetricLoss(LossModule):
         - ``loss_regularizer``: Eq. 5 times ``weight`` (absent with ``regularizer="none"``);
         - ``loss_dynamics``: negative log-likelihood of the next embedding, each dimension times
           its own detached standard deviation (``"gaussian"`` only);
-        - ``mean_distance``, ``mean_reward_difference``: over the pairs, detached; Theorem 1 ties
-          them together (:func:`~torchrl_etl.functional.expected_distance`);
+        - ``mean_distance``, ``mean_reward_difference``: over the pairs, detached; Theorem 1 relates
+          them (:func:`~torchrl_etl.functional.expected_distance`);
         - ``effective_rank``: of the embeddings, detached; near 1 means one used dimension.
 
     Deviates:
-        - Eq. 5: as printed it contracts the pairs that it is said to keep apart; the default is a
-          hinge, ``"literal"`` the print (see :func:`~torchrl_etl.functional.discriminability`).
-        - The divergence of Eq. 2 is left open in the paper: ``"sampled"`` is the distance of the
+        - Eq. 5: as printed it contracts the pairs that it is said to keep apart. The default is a
+          hinge; ``"literal"`` is as printed (:func:`~torchrl_etl.functional.discriminability`).
+        - The paper leaves the divergence of Eq. 2 open: ``"sampled"`` is the distance of the
           sampled next states (MICo), ``"gaussian"`` the 2-Wasserstein distance of a latent model's
-          predictions (DBC). Both are computed with a target encoder: bootstrapped on itself the
-          distances run away. The latent model's likelihood is weighted by its standard deviation:
-          unweighted, near-deterministic transitions shrank it until single gradients threw the
-          means off, and the distances ran away (to 4e5 where Eq. 4 says 1.7).
-        - Termination is not treated in the paper. Here all terminated next states are one
-          absorbing state, embedded at the origin: two episodes that have ended have no distance
-          left, and one that goes on is as far from the end as its embedding is long. (For MICo's
-          diffuse metric the origin is exact: a state without reward ever after has norm zero.)
-          Truncation is not an end and bootstraps as usual.
+          predictions (DBC). Both use a target encoder: bootstrapped on the same encoder, distances
+          diverge. The latent model's likelihood is weighted by its standard deviation. Unweighted,
+          near-deterministic transitions shrank the deviation until single gradients threw the
+          means off, and distances diverged (to 4e5 where Eq. 4 says 1.7).
+        - The paper does not treat termination. Here all terminated next states are one absorbing
+          state, embedded at the origin. Two ended episodes have distance zero; a state's distance
+          from the end is the norm of its embedding. (For MICo's diffuse metric the origin is
+          exact: a state without any further reward has norm zero.) Truncation bootstraps as usual.
 
     Args:
         encoder (TensorDictModule): the state encoder; its first out key is the embedding [*, k].
         dynamics (TensorDictModule, optional): latent dynamics, embedding → mean and standard
-            deviation of the next embedding. Needed for, and only for, ``divergence="gaussian"``.
+            deviation of the next embedding. Only for ``divergence="gaussian"``, which needs it.
 
     Keyword Args:
         divergence (str): ``"sampled"`` or ``"gaussian"``. Default: ``"sampled"``.
@@ -73,19 +72,19 @@ class BehavioralMetricLoss(LossModule):
             Default: ``"permuted"``.
         epsilon (float): pairs whose (scaled) rewards differ by less are regularized.
             Default: ``0.01``.
-        margin (float): distance at which the hinge goes silent. Default: ``1.0``.
+        margin (float): distance from which the hinge is zero. Default: ``1.0``.
         weight (float): the regularizer's weight λ in Eq. 6. Default: ``0.1``.
         gamma (float): discount factor in [0, 1). Default: ``0.95``.
         reward_scale (float): factor on the rewards, which sets the unit of every distance. It is
             a buffer: it is saved with the loss and may be assigned at any time. Default: ``1.0``.
-        delay_encoder (bool): keep a separate target encoder, for ``SoftUpdate`` to move. Without
-            it the target is the present encoder, detached. Default: ``True``.
+        delay_encoder (bool): keep a target encoder, which ``SoftUpdate`` updates. Otherwise targets
+            use the current encoder, detached. Default: ``True``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` (one value per sample, averaged over
             its pairs). Default: ``"mean"``.
 
     Raises:
-        ValueError: at construction for an unknown choice, a number out of range, or options that
-            do not go together; in ``forward`` for a batch of one sample, which has no pairs.
+        ValueError: at construction for an unknown choice, a number out of range, or incompatible
+            options; in ``forward`` for a batch of one sample, which has no pairs.
         TypeError: if a network is not a TensorDict module.
 
     Examples:
@@ -188,7 +187,7 @@ class BehavioralMetricLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
+        """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
         reward = read(type(self).__name__, tensordict["next"], self.tensor_keys.reward, "next")
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale
@@ -235,7 +234,7 @@ class BehavioralMetricLoss(LossModule):
         )
 
     def _predict(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation [samples, k] of what follows, in the targets' space."""
+        """Predicted mean and standard deviation [samples, k] of the next target embedding."""
         with torch.no_grad():
             embedding = outputs(self.encoder, target_params(self), tensordict)
         inputs = TensorDict({self.dynamics.in_keys[0]: embedding}, embedding.shape[:-1])
@@ -249,7 +248,7 @@ class BehavioralMetricLoss(LossModule):
 
 
 def _check_divergence(divergence: str, distance: str, dynamics: object) -> None:
-    """Refuse a divergence without what it is computed of, or beside what it does not read."""
+    """Check that dynamics and distance fit the divergence."""
     if divergence == "gaussian":
         if dynamics is None:
             raise ValueError(
@@ -272,7 +271,7 @@ def _check_divergence(divergence: str, distance: str, dynamics: object) -> None:
 def _dynamics_nll(value: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
     """Negative log-likelihood [*] with every dimension weighted by its detached deviation.
 
-    The plain gradient of the mean grows as error / scale², here as error / scale (Seitzer et al.,
+    The gradient of the mean then grows as error / scale, instead of error / scale² (Seitzer et al.,
     2022, with beta = 1/2).
     """
     each = functional.gaussian_log_prob(*(x.unsqueeze(-1) for x in (value, loc, scale)))

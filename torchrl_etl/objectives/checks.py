@@ -13,7 +13,7 @@ __all__ = ["check_parts", "read", "warn_of_previous_action"]
 
 
 def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
-    """An entry, or a ``KeyError`` that names it, and says of an action where it is.
+    """Get an entry, or raise a ``KeyError`` that names it and, for an action, where to find it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -39,7 +39,7 @@ def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) 
 
 
 def warn_of_previous_action(reader: str, keys: Iterable[NestedKey]) -> None:
-    """Warn if a loss reads root ``executed_action``, which belongs to the step before.
+    """Warn if a loss reads root ``executed_action``, which belongs to the previous step.
 
     Examples:
         >>> warn_of_previous_action("DecoderLoss", ["action", ("next", "executed_action")])

@@ -24,14 +24,14 @@ class DecoderLoss(LossModule):
 
     Keys:
         reads ``synergy`` [*, d] (or [*, d+n], see :class:`~torchrl_etl.modules.SynergyDecoder`)
-        and ``action`` [*, n]; writes ``loss_decoder``. Whatever keys the decoder itself reads and
-        writes, the batch is read at the keys set with :meth:`set_keys`.
+        and ``action`` [*, n]; writes ``loss_decoder``. The batch is read at the keys set with
+        :meth:`set_keys`, whatever the decoder's own keys are.
 
-    Deviates: nothing here, but in use. The recorded action *is* ``Dec(synergy)`` of the decoder of
-        its time, so on fresh pairs the gradient is zero and on stale ones it pulls back to old
-        outputs; no reward reaches the decoder this way. As the sole fine-tuning signal it is the
-        paper's literal reading; next to an actor loss that runs through the decoder it is the
-        distillation term that keeps the synergies from drifting.
+    Deviates: only in its use. The recorded action *is* ``Dec(synergy)`` of the decoder at that
+        time. So the gradient is zero on fresh pairs, pulls back to old outputs on stale ones, and
+        carries no reward to the decoder. As the only fine-tuning signal this is the paper's literal
+        reading. Next to an actor loss through the decoder it is a distillation term that keeps the
+        synergies from drifting.
 
     Args:
         decoder (TensorDictModule): synergy → action; first in key and first out key are used.
@@ -89,7 +89,7 @@ class DecoderLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
+        """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
         name, keys = type(self).__name__, self.tensor_keys
         synergy = read(name, tensordict, keys.synergy).detach()
         action = read(name, tensordict, keys.action).detach()

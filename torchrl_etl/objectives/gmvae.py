@@ -23,14 +23,14 @@ __all__ = ["GMVAELoss"]
 class GMVAELoss(LossModule):
     r"""Negative variational bound of a Gaussian-mixture VAE on actions.
 
-    Equation: 9, negated to be minimized. Both weights at 1 are the print; with one component it is
+    Equation: 9, negated to be minimized, as printed if both weights are 1. With one component it is
     the loss of an ordinary VAE ("ETL w/o GM").
 
     Keys:
         reads ``action`` [*, n] in action units. Writes ``loss_gmvae``, and detached batch means in
         nats: ``reconstruction`` (log-likelihood of the action scaled to [-1, 1]), ``latent_kl``,
         ``component_kl`` and ``component_entropy``, the entropy of the batch's average ``q(c|a)``:
-        log C when all components are in use, 0 when one has taken everything.
+        log C when all components are used equally, 0 when only one is used.
 
     Deviates: the expectation over components is exact, the likelihood is Gaussian with a learned
         scale, and the prior means are learned; the paper leaves all three open.
@@ -103,12 +103,12 @@ class GMVAELoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
+        """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
         action = read(type(self).__name__, tensordict, self.tensor_keys.action).detach()
         gmvae = self.gmvae
         with self.gmvae_params.to_module(gmvae, preserve_module_state=False):
             posterior = gmvae.encode(action)
-            # Drawn by hand: inside a loss TorchRL turns every distribution's sample into its mode.
+            # Sampled by hand: inside a loss, TorchRL's distributions return their mode as sample.
             latent = posterior.loc + posterior.scale * standard_normal(posterior.loc)
             terms = functional.gmvae_bound(
                 gmvae.normalize(action),
@@ -135,7 +135,7 @@ class GMVAELoss(LossModule):
         )
 
     def reset_parameters_recursive(self) -> None:
-        """Put the model back to fresh initial parameters, its prior included."""
+        """Reinitialize the model, including its prior."""
         with self.gmvae_params.to_module(self.gmvae, preserve_module_state=False):
             config = self.gmvae.config
         self.from_stateful_net("gmvae", GMVAE(**config).to(self._default_device))

@@ -1,4 +1,4 @@
-"""A state encoder whose steps have bounded length (METRA), the other way to hold φ's scale."""
+"""METRA's loss for a state encoder, which bounds the scale of φ by the length of a step."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ __all__ = ["METRALoss"]
 
 
 class METRALoss(LossModule):
-    r"""Loss that spreads state embeddings along the directions, one step never longer than 1.
+    r"""Loss that spreads state embeddings along the directions, with steps no longer than 1.
 
-    Eq. 1's bonus telescopes to a displacement, so it is as large as φ makes it. Here φ maximises
-    the bonus itself under a bound on ‖φ(s') - φ(s)‖, which turns distances of embeddings into
-    lower bounds on the number of steps between states (Park 2024). It may stand in for
-    :class:`~torchrl_etl.objectives.BehavioralMetricLoss` in stage 1: it reads no reward, compares
-    the two ends of a transition instead of pairs of them, and bootstraps on nothing, so it has no
-    target network.
+    The bonus of Eq. 1 telescopes to a displacement, so its size depends on the scale of φ. Here φ
+    maximizes the bonus under a bound on ‖φ(s') - φ(s)‖. Distances of embeddings are then lower
+    bounds on the number of steps between states (Park 2024). It can replace
+    :class:`~torchrl_etl.objectives.BehavioralMetricLoss` in stage 1. It reads no reward, compares
+    the two ends of a transition instead of pairs of transitions, and needs no target network.
 
     Equation: φ maximises ``⟨φ(s') - φ(s), z⟩ + λ min(ε, 1 - ‖φ(s') - φ(s)‖²)``; λ minimises
     ``log λ · min(ε, 1 - ‖φ(s') - φ(s)‖²)``, the other factor held fixed.
@@ -38,27 +37,27 @@ class METRALoss(LossModule):
         ``direction`` [*, k], a unit vector. Writes
 
         - ``loss_representation``: for φ, the objective above negated;
-        - ``loss_lambda``: for λ. Its gradient raises λ where steps are too long and, at ε, lets it
-          fall slowly where they are not;
+        - ``loss_lambda``: for λ, which rises where steps are too long and falls where they are
+          not, with a gradient of at most ε;
         - ``mean_bonus``: Eq. 1 over the batch, detached;
         - ``mean_step``: length of the steps ‖φ(s') - φ(s)‖ over the batch, detached;
         - ``multiplier``: λ, detached;
         - ``effective_rank``: of the embeddings, detached; near 1 means one used dimension.
 
     Deviates:
-        - ``norm="sum"`` bounds ‖φ(s') - φ(s)‖² by 1, METRA's print, so that the bonus lies in
-          [-1, 1] whatever k is. METRA's public code takes the mean over dimensions
+        - ``norm="sum"`` bounds ‖φ(s') - φ(s)‖² by 1, as in METRA's paper, so that the bonus lies in
+          [-1, 1] for every k. METRA's public code takes the mean over dimensions
           (``norm="mean"``), which lets steps grow to √k.
-        - λ is updated through its logarithm, as in METRA's public code: it stays positive, and the
-          gradient does not carry λ as a factor.
+        - λ is updated through its logarithm, as in METRA's public code: it stays positive, and its
+          gradient does not contain λ as a factor.
 
     Args:
         encoder (TensorDictModule): φ; its first out key is the embedding [*, k].
 
     Keyword Args:
-        epsilon (float): ε, positive: room beyond which shorter steps earn φ nothing.
-            Default: ``1e-3``.
-        lambda_init (float): λ at the start, positive. Default: ``30.0``.
+        epsilon (float): ε, positive: slack of the bound beyond which φ gains nothing from shorter
+            steps. Default: ``1e-3``.
+        lambda_init (float): initial λ, positive. Default: ``30.0``.
         norm (str): ``"sum"`` or ``"mean"`` of squares over dimensions. Default: ``"sum"``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"`` (one value per sample).
             Default: ``"mean"``.
@@ -137,7 +136,7 @@ class METRALoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
+        """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
         name = type(self).__name__
         direction = read(name, tensordict, self.tensor_keys.direction).detach()
         batch_size = direction.shape[:-1]
@@ -171,14 +170,14 @@ class METRALoss(LossModule):
 
     def _embed(self, tensordict: TensorDictBase, batch_size: torch.Size) -> Tensor:
         """Embeddings [*, k]."""
-        # A tensordict of nothing but observations may count their size as part of the batch's.
+        # A tensordict with observations only may count their last size as a batch size.
         inputs = TensorDict({key: tensordict[key] for key in self.encoder.in_keys}, batch_size)
         with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
             written = self.encoder(inputs)
         return written.get(self.encoder.out_keys[0])
 
     def reset_parameters_recursive(self) -> None:
-        """Put encoder and λ back to fresh initial values."""
+        """Reinitialize encoder and λ."""
         super().reset_parameters_recursive()
         with torch.no_grad():
             self.log_lambda.fill_(math.log(self.lambda_init))

@@ -1,4 +1,4 @@
-"""What losses on pairs of transitions share: who meets whom, and a network's output for all."""
+"""Helpers of losses on pairs of transitions: pairing samples and embedding their states."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["embedded_ends", "outputs", "partners", "target_params"]
 def partners(
     samples: int, device: torch.device, pairs: Literal["permuted", "all"] = "permuted"
 ) -> Tensor:
-    """Indices [samples, pairs per sample] of the others that each sample is compared with.
+    """Indices [samples, pairs per sample] of the samples that each one is compared with.
 
     Examples:
         >>> partners(3, torch.device("cpu"), "all")
@@ -47,16 +47,16 @@ def outputs(
 
 
 def target_params(loss: LossModule) -> TensorDictParams:
-    """Parameters of a loss's target encoder, or the encoder's own where it has no target.
+    """Parameters of a loss's target encoder, or of its encoder if it has no target.
 
-    TorchRL 0.14.1 gives out the latter's ``data`` then, which cannot be read under ``vmap``.
+    In the latter case TorchRL 0.14.1 returns ``data``, which cannot be read under ``vmap``.
     """
     has_target = loss._modules.get("target_encoder_params") is not None
     return loss.target_encoder_params if has_target else loss.encoder_params
 
 
 def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Embeddings [samples, k] of both ends by a loss's encoder, the next by its target.
+    """Embeddings [samples, k] of both ends; next states use the loss's target encoder.
 
     All terminated next states are one absorbing state, embedded at the origin.
     """

@@ -29,45 +29,45 @@ __all__ = ["LeanSACLoss", "call"]
 
 
 class LeanSACLoss(SACLoss):
-    """:class:`torchrl.objectives.SACLoss`, number for number, in about half its time.
+    """:class:`torchrl.objectives.SACLoss` with the same values, in about half the time.
 
-    On two small critics ``vmap`` costs more than it saves: it takes fused kernels apart (layer
-    norm, the bias in a product) and passes every operation through one more dispatcher. Here the
-    critics are evaluated one after the other, on the entries that they read and no others.
+    On two small critics ``vmap`` costs more than it saves: it splits fused kernels (layer norm,
+    the bias of a linear layer) and adds a dispatcher to every operation. Here the critics are
+    evaluated one after the other, on only the entries that they read.
 
-    With a ``support`` the critics are categorical: they output the logits of a distribution of the
-    return on it. Their target is the whole distribution of the critic with the smaller mean,
-    shifted by the entropy bonus and the reward, shrunk by the discount, and projected back
-    (Bellemare 2017); the actor maximizes the smaller mean.
+    With a ``support`` the critics are categorical: they output logits of a return distribution on
+    it. Their target is the distribution of the critic with the smallest mean, shifted by the
+    entropy bonus and the reward, shrunk by the discount, and projected back (Bellemare 2017). The
+    actor maximizes the smallest mean.
 
     Args:
-        actor_network (ProbabilisticTensorDictSequential): the policy; the parts of a composite
-            distribution lie under one key, the action.
-        qvalue_network (TensorDictModule): the critic, which is copied ``num_qvalue_nets`` times.
-            A module of tensors with one output is called without a tensordict; others
-            (sequences, inputs by keyword, several outputs) take somewhat longer.
+        actor_network (ProbabilisticTensorDictSequential): the policy; a composite distribution has
+            its parts under one key, the action.
+        qvalue_network (TensorDictModule): the critic, copied ``num_qvalue_nets`` times. A module
+            of tensors with one output is called without a tensordict; others (sequences, inputs
+            by keyword, several outputs) are somewhat slower.
 
     Keyword Args:
         support (Tensor, optional): evenly spaced returns [K], ascending; the critics then have K
-            outputs. Default: ``None``, one output that is the value itself.
-        loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``, of scalar critics' errors;
-            categorical critics always minimize the cross entropy. ``"l2"`` is the square itself,
-            summed over critics; Stable-Baselines3 takes half of it. Default: ``"l2"``, where
-            TorchRL has ``"smooth_l1"``: only the square makes the critic the *mean* return.
-        counted (int, optional): entropy is that of so many leading entries of a tanh-Gaussian
-            sample, where the noise of the others is none of the actor's choice. Default: of all.
+            outputs. Default: ``None``, one output, the value itself.
+        loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``, for scalar critics; categorical
+            critics always minimize cross entropy. ``"l2"`` is the squared error, summed over
+            critics; Stable-Baselines3 takes half of it. Default: ``"l2"``. TorchRL's is
+            ``"smooth_l1"``, but only the square makes critics estimate the *mean* return.
+        counted (int, optional): measure the entropy of only the first ``counted`` entries of a
+            tanh-Gaussian sample, if the actor cannot choose the others' noise. Default: all.
         **kwargs: see :class:`torchrl.objectives.SACLoss`.
 
     Keys:
-        those of SACLoss.
+        as in SACLoss.
 
     Raises:
-        TypeError: if actor or critic is of another class, or a ``value_network`` or
+        TypeError: if actor or critic is of the wrong class, or a ``value_network`` or
             ``skip_done_states`` is given.
         ValueError: for an unknown reduction or ``loss_function``, a support that is not evenly
             spaced and ascending or not of the critics' size, ``counted`` with an actor that is no
-            tanh-Gaussian, an actor that samples several keys, or a critic of several outputs none
-            of which is the ``state_action_value``.
+            tanh-Gaussian, an actor that samples several keys, or a critic with several outputs but
+            no ``state_action_value``.
 
     Examples:
         >>> import torch
@@ -147,7 +147,7 @@ class LeanSACLoss(SACLoss):
         """See :meth:`torchrl.objectives.SACLoss.make_value_estimator`.
 
         Raises:
-            ValueError: for another estimator than TD0 with a ``support``.
+            ValueError: for an estimator other than TD0 with a ``support``.
         """
         one_step = value_type in (None, ValueEstimators.TD0, TD0Estimator)
         if self.support is not None and not (one_step or isinstance(value_type, TD0Estimator)):
@@ -161,9 +161,9 @@ class LeanSACLoss(SACLoss):
         """Nothing is vmapped."""
 
     def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """A fresh action and its log-probability; the tensordict is left as it is."""
-        # The actor writes loc and scale, graph and all: into a copy. Those of a composite
-        # distribution count among its inputs, and need not be there.
+        """A fresh action and its log-probability; the tensordict is not modified."""
+        # A copy, since the actor writes loc and scale with their graph. A composite distribution
+        # lists its parameters among the in-keys; they may be missing.
         observed = tensordict.select(*self.actor_network.in_keys, strict=False).copy()
         with (
             set_exploration_type(ExplorationType.RANDOM),
@@ -172,12 +172,12 @@ class LeanSACLoss(SACLoss):
             return drawn(self.actor_network.get_dist(observed), counted=self.counted)
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
-        """What the critics read where the actor's ``action`` is taken."""
+        """The critics' inputs, with the actor's ``action``."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         return inputs.set(self.tensor_keys.action, action)
 
     def _outputs(self, inputs: TensorDictBase, weights: dict[str, Tensor]) -> Tensor:
-        """What the critics with these weights, all of them stacked, say: [critics, *, K or 1]."""
+        """Outputs [critics, *, K or 1] of the critics with these stacked weights."""
         each = zip(*(weight.unbind(0) for weight in weights.values()), strict=True)
         outputs = [
             call(self.qvalue_network, dict(zip(weights, one, strict=True)), inputs, self._value_key)
@@ -200,7 +200,7 @@ class LeanSACLoss(SACLoss):
 
     def _weights(self, network: str, *, detached: bool = False) -> dict[str, Tensor]:
         """Parameters and buffers of a network by their dotted names."""
-        # Not named_parameters: it keeps naming the loss's own where others stand in for them.
+        # Not named_parameters: it names the loss's own even while others are swapped in.
         leaves = getattr(self, f"{network}_params").items(True, True)
         weights = {k if isinstance(k, str) else ".".join(k): x for k, x in leaves}
         return {k: x.detach() for k, x in weights.items()} if detached else weights
@@ -218,7 +218,7 @@ class LeanSACLoss(SACLoss):
                 return self._bootstrap(tensordict, value)
             smaller = self._mean(outputs).argmin(0)[None, ..., None].expand_as(outputs[:1])
             probabilities = outputs.gather(0, smaller).squeeze(0).softmax(-1)
-            # The target is affine in the next value: two of them tell it for the whole support.
+            # The target is affine in the next value: two values determine it on the whole support.
             start = self._bootstrap(tensordict, torch.zeros_like(log_prob))
             slope = self._bootstrap(tensordict, torch.ones_like(log_prob)) - start
             following_atoms = self.support - (self._alpha * log_prob).unsqueeze(-1)
@@ -251,8 +251,8 @@ class LeanSACLoss(SACLoss):
         return self._reduced(each, tensordict), {"log_prob": log_prob.detach()}
 
     def _clear_weakrefs(self, *tds: TensorDictBase | str) -> None:
-        # SACLoss also names target networks that it does not have: a compiled loss would make
-        # them, detached, at every call.
+        # SACLoss also names target networks that do not exist: a compiled loss would create them,
+        # detached, at every call.
         super()._clear_weakrefs(*(td for td in tds if not isinstance(td, str)))
 
     def _reduced(self, each: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -279,9 +279,9 @@ def drawn(
 ) -> tuple[Tensor, Tensor]:
     """Reparametrized samples [S, *, n] with their log-probabilities [S, *].
 
-    Of a tanh-Gaussian, those of the ``counted`` leading entries.
+    For a tanh-Gaussian, only the first ``counted`` entries count in the log-probability.
 
-    ``Normal.rsample`` fills an empty tensor in place, which ``torch.vmap`` refuses.
+    ``Normal.rsample`` is avoided: it fills an empty tensor in place, which ``torch.vmap`` refuses.
     """
     if not isinstance(distribution, TanhNormal):
         return compute_rsample_log_prob(distribution)
@@ -295,7 +295,7 @@ def drawn(
 
 
 def value_key(critic: TensorDictModule, name: NestedKey) -> NestedKey:
-    """The output of a critic that is its value: the one that it has, or that of this name."""
+    """Key of a critic's value: its only output, or the one of this name."""
     outputs = list(critic.out_keys)
     if len(outputs) == 1:
         return outputs[0]
@@ -313,7 +313,7 @@ def call(
     inputs: TensorDictBase,
     out_key: NestedKey,
 ) -> Tensor:
-    """An output of a network, computed with other weights than its own; inputs stay as they are."""
+    """A network's output with the given weights; ``inputs`` is not modified."""
     if len(network.out_keys) > 1 or not calls_module_only(network):
         inputs = inputs.select(*network.in_keys, strict=False).copy()
         return functional_call(network, weights, (inputs,), tie_weights=False).get(out_key)

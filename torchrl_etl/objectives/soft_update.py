@@ -1,4 +1,4 @@
-"""Target networks that follow in one operation."""
+"""Soft update of target networks in one operation."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["FusedSoftUpdate"]
 
 
 class FusedSoftUpdate(SoftUpdate):
-    """:class:`torchrl.objectives.SoftUpdate`, all parameters at once instead of one by one.
+    """:class:`torchrl.objectives.SoftUpdate` of all parameters at once instead of one by one.
 
     Args:
-        loss_module (LossModule): the loss whose target parameters follow.
+        loss_module (LossModule): the loss whose target parameters are updated.
 
     Keyword Args:
         tau (float) or eps (float): see :class:`torchrl.objectives.SoftUpdate`.
@@ -42,7 +42,7 @@ class FusedSoftUpdate(SoftUpdate):
         torch._foreach_lerp_(self.followers, self.followed, 1 - self.eps)
 
     def over(self, other: Callable[[Tensor], Tensor]) -> FusedSoftUpdate:
-        """The same for other tensors than these."""
+        """The same update with each tensor replaced by ``other(tensor)``."""
         twin = copy(self)
         twin.followers = list(map(other, self.followers))
         twin.followed = list(map(other, self.followed))

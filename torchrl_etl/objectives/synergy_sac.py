@@ -1,4 +1,4 @@
-"""SAC whose policy speaks synergies and whose critics see muscles."""
+"""SAC with a policy over synergies and critics on muscle actions."""
 
 from __future__ import annotations
 
@@ -19,18 +19,16 @@ __all__ = ["SynergySACLoss"]
 class SynergySACLoss(LeanSACLoss):
     """SAC in synergy space with critics on the executed action.
 
-    The actor emits coefficients z^a; the critics value Q(s, a). Where the loss draws fresh
-    coefficients (actor loss, bootstrap target) they pass through the current decoder; where a
-    transition is replayed, the critics see the ``action`` that was executed. Hence the critics'
-    targets stay right while the decoder moves, and the actor loss can carry the task's reward
-    into the decoder.
+    The actor outputs coefficients z^a; the critics estimate Q(s, a). Coefficients that the loss
+    draws (actor loss, bootstrap target) pass through the current decoder. For replayed transitions
+    the critics read the ``action`` that was executed. So the critics' targets stay correct while
+    the decoder changes, and the actor loss can train the decoder on the task's reward.
 
-    Entropy is that of the coefficients and of the action given them: a decoder with a residual
-    says by its ``log_slope`` how far the action moves with it
-    (:meth:`~torchrl_etl.modules.SynergyDecoder.log_slope`). Without this, noise that the bounds of
-    the action swallow would count. Where a residual has noise of a fixed size, ``counted``
-    coefficients alone have an entropy that is the policy's choice, and theirs is what counts: in
-    units of the action the rest could only change it by keeping muscles off their bounds.
+    Entropy is measured over the coefficients and the action given them: the decoder's
+    :meth:`~torchrl_etl.modules.SynergyDecoder.log_slope` corrects for how far the action moves with
+    the residual. Otherwise noise that the action's bounds suppress would count. If the residual's
+    noise has a fixed size, set ``counted``: only the coefficients' entropy counts then, without the
+    correction. The policy could change the rest only by keeping muscles off their bounds.
 
     Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL, without a state-value network.
 
@@ -44,17 +42,17 @@ class SynergySACLoss(LeanSACLoss):
 
     Keyword Args:
         train_decoder (bool): let ``loss_actor`` reach the decoder. Default: ``True``.
-        **kwargs: see :class:`~torchrl_etl.objectives.LeanSACLoss`; give ``action_spec`` unbatched,
-            of the coefficients.
+        **kwargs: see :class:`~torchrl_etl.objectives.LeanSACLoss`; ``action_spec`` is the unbatched
+            spec of the coefficients.
 
     Keys:
-        those of SACLoss, with the critics' action (root entry [*, n], the executed one) in place
-        of the policy's: recorded coefficients are not read. As SACLoss does, it writes
-        ``td_error`` [*] into its input.
+        as in SACLoss, but the action is the executed one that the critics read (root entry
+        [*, n]); recorded coefficients are not read. Like SACLoss, it writes ``td_error`` [*] into
+        its input.
 
     Raises:
         TypeError: if the decoder is not a TensorDict module, or a ``value_network`` is given.
-        ValueError: if the decoder does not join the actor's sample to the critics' input, or the
+        ValueError: if the decoder does not map the actor's sample to the critics' action, or the
             critics read the sample itself; for an unknown reduction.
 
     Examples:
