@@ -1,4 +1,4 @@
-"""TorchRL transforms: an episode's direction, bonuses for exploring, synergies as actions."""
+"""TorchRL transforms: episode directions, exploration bonuses, and synergies as actions."""
 
 from torchrl_etl.transforms.direction import DirectionPrimer
 from torchrl_etl.transforms.intrinsic_reward import IntrinsicReward

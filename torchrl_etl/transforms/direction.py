@@ -21,15 +21,15 @@ __all__ = ["DirectionPrimer"]
 class DirectionPrimer(SoleWriter, TensorDictPrimer):
     """Draws a unit vector at the start of each episode and keeps it until the end.
 
-    Works on single, serial, parallel and vectorized envs without being told the batch size. At a
-    partial reset only the envs that start anew get a new direction. Draws come from torch's global
+    Works on single, serial, parallel and vectorized envs; the batch size comes from the env. At a
+    partial reset only the envs that reset get a new direction. Draws come from torch's global
     generator. TorchRL does not seed it in worker processes until ``set_seed`` is called on the
     batched env or collector: without that call workers can draw identical directions.
 
-    In a group of agents (``out_key=("agents", "direction")``) each draws a direction of its own.
+    In a group of agents (``out_key=("agents", "direction")``) each agent gets its own direction.
 
     Called on a tensordict outside an env (in an ``nn.Sequential``, on a replay buffer's sample
-    path) it draws one direction per element where none is present, and leaves present ones alone.
+    path) it draws one direction per element, unless the tensordict already has directions.
 
     Equation: z_sp of Eq. 1.
 
@@ -52,8 +52,7 @@ class DirectionPrimer(SoleWriter, TensorDictPrimer):
 
     Raises:
         ValueError: if a size is not positive, the kind is unknown, or ``num_directions`` does not
-            fit the kind or exceeds k; when attached, if ``out_key`` is written by something else
-            too.
+            fit the kind or exceeds k; when attached, if something else also writes ``out_key``.
 
     Examples:
         >>> import torch
@@ -113,8 +112,8 @@ class DirectionPrimer(SoleWriter, TensorDictPrimer):
         return self.primers[self.out_keys[0]]
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        # The base class expands ``self.primers`` in place, which ties the transform to the first
-        # env it meets; ours stays unbatched, so a clone serves an env of another batch size.
+        # The base class expands ``self.primers`` in place, which ties the transform to its first
+        # env. Here they stay unbatched, so a clone serves an env of another batch size.
         (key,) = self.out_keys
         leaf = self._leaf.expand(*group_shape(self.parent, key), self.embedding_dim)
         if observation_spec.device is not None:
@@ -130,13 +129,13 @@ class DirectionPrimer(SoleWriter, TensorDictPrimer):
     def _reset_func(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        # A draw for every env: at a partial reset the env keeps those of the envs that reset.
+        # Draws for every env: at a partial reset TorchRL keeps only those of the envs that reset.
         return tensordict_reset.set(self.out_keys[0], self._drawn_for(tensordict_reset))
 
     def _drawn_for(self, tensordict_reset: TensorDictBase) -> Tensor:
         (key,) = self.out_keys
         shape = tensordict_reset.batch_size
-        if self.parent is not None:  # an env that is not batch-locked leaves its size to the data
+        if self.parent is not None:  # without a batch lock the size comes from the data
             shape = shape + group_shape(self.parent, key)[self.parent.ndim :]
         elif not isinstance(key, str) and key[:-1] in tensordict_reset.keys(True):
             shape = tensordict_reset.get(key[:-1]).batch_size
@@ -158,7 +157,7 @@ class DirectionPrimer(SoleWriter, TensorDictPrimer):
     ) -> None:
         """See :class:`~torchrl_etl.collectors.VectorCollector`."""
         (key,) = self.out_keys
-        drawn = self.draw(torch.Size(done.shape)).numpy()  # for all, as in a plain reset
+        drawn = self.draw(torch.Size(done.shape)).numpy()  # for all rows, as in a plain reset
         fresh[key] = np.where(done[:, None], drawn, now[key])
 
     def __repr__(self) -> str:

@@ -24,36 +24,36 @@ class IntrinsicReward(ScaledBonus):
     The same class works in four places:
 
     - on an env: every step writes the bonus, for logging or on-policy learners. The env's state
-      spec then holds the direction and a private copy of the observation, so that the bonus is
-      that of the observations which this transform sees, whatever later transforms make of them;
-    - on a replay buffer: every *sampled* batch gets the bonus of the current encoder, so that the
-      reward is never stale. Nothing is written when the buffer is extended;
-    - among the transforms of a :class:`~torchrl_etl.learners.SACLearner`: the same, inside of the
+      spec then holds the direction and a private copy of the observation, so that later transforms
+      of the observation do not change the bonus;
+    - on a replay buffer: every *sampled* batch gets the bonus of the current encoder, so the reward
+      is never stale. Nothing is written when the buffer is extended;
+    - among the transforms of a :class:`~torchrl_etl.learners.SACLearner`: the same, inside the
       compiled update;
-    - called on a tensordict with root and ``"next"`` entries, any batch size, time included.
+    - called on a tensordict with root and ``"next"`` entries, of any batch size, including time.
 
-    In a group of agents each has a bonus of its own; a direction outside of the group is that of
-    all. Under n-step returns a bonus on the environment is a reward like any other and has to be
-    named: ``MultiStepTransform(..., reward_keys=["reward", "intrinsic_reward"])``, or the attribute
-    ``reward_keys`` of ``MultiStep``. On a buffer the bonus of an n-step transition is that of its
-    two ends, which is the undiscounted sum over the steps between.
+    In a group of agents each has its own bonus; a direction outside the group is shared by all.
+    With n-step returns, a bonus on the environment must be named as a reward:
+    ``MultiStepTransform(..., reward_keys=["reward", "intrinsic_reward"])``, or the attribute
+    ``reward_keys`` of ``MultiStep``. On a buffer, the bonus of an n-step transition is computed
+    from its two ends and equals the undiscounted sum over its steps.
 
-    The encoder is held by reference and belongs to whoever trains it: the transform evaluates it
-    without gradients on the encoder's own device and never copies, moves, freezes or switches it
-    between train and eval mode, and ``state_dict()`` holds the running statistics only. In another
-    process the encoder is the copy made when the worker started.
+    The encoder is held by reference. It is evaluated without gradients on its own device, and the
+    transform never copies, moves or freezes it or changes its train or eval mode. ``state_dict()``
+    holds only the running statistics. In another process the encoder is the copy made when the
+    worker started.
 
     Equation: 1, r^b = ⟨φ(s') - φ(s), z_sp⟩.
 
-    Deviates: the print uses the bare bonus, whose scale drifts with φ. By default it is divided by
-    its running standard deviation (no mean is subtracted: the sign says towards or away), and by
-    no less than a tenth of its root mean square, and so is the task's reward where it is added;
-    ``normalize=False`` is the print. By default the reward is the bonus alone, as in Algorithm 1;
+    Deviates: Eq. 1 is the bare bonus, whose scale drifts with φ. By default the bonus, and the
+    task's reward if added, are divided by their running standard deviations, at least a tenth of
+    their root mean squares. No mean is subtracted, since the sign says towards or away.
+    ``normalize=False`` is as printed. By default the reward is the bonus alone, as in Algorithm 1;
     ``extrinsic_weight=1`` is the text's r^e + r^b.
 
     Args:
-        encoder (TensorDictModuleBase): φ, with one in-key and one out-key. Its own key names need
-            not be those of the data.
+        encoder (TensorDictModuleBase): φ, with one in-key and one out-key. Its key names may differ
+            from the data's.
 
     Keyword Args:
         in_keys (sequence of NestedKey): keys of observation and direction. Default:
@@ -71,7 +71,7 @@ class IntrinsicReward(ScaledBonus):
         TypeError: if the encoder has no in- and out-keys.
         ValueError: if the encoder has several of them, ``in_keys`` is not a pair, or ``decay`` is
             outside (0, 1); at the first call if embedding and direction differ in size.
-        ValueError: when attached, if ``out_key`` is written by something else too.
+        ValueError: when attached, if something else also writes ``out_key``.
         KeyError: if an input is in neither the tensordict nor the specs of the env.
 
     Examples:
@@ -121,8 +121,8 @@ class IntrinsicReward(ScaledBonus):
                 f"in_keys is {in_keys!r}; pass a pair of keys, the observation and the direction."
             )
         super().__init__(in_keys, out_key, **scale)
-        # Outside the module list: as a submodule the encoder would follow the env's device, be put
-        # in eval mode under the learner's feet, and be saved twice.
+        # Not a submodule: it would follow the env's device, be put in eval mode while the learner
+        # uses it, and be saved twice.
         self.__dict__["encoder"] = encoder
 
     @property
@@ -142,7 +142,7 @@ class IntrinsicReward(ScaledBonus):
     ) -> Tensor:
         direction_key = self.in_keys[1]
         direction = self._read(tensordict, direction_key)
-        # Each end by itself: a compiled update has the first from the encoder's own loss.
+        # Each end separately: a compiled update reuses the first one from the encoder's loss.
         ends = observation, next_observation
         embedding, next_embedding = (evaluate(self.encoder, end).to(direction) for end in ends)
         if embedding.shape[-1] != direction.shape[-1]:

@@ -1,4 +1,4 @@
-"""Where a transform's key lies in an environment, and who else writes it."""
+"""Keys of transforms: their group in an environment, and conflicts with other writers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
 
 
 def group_shape(env: EnvBase, key: NestedKey) -> torch.Size:
-    """Batch size of the group (of agents, say) that ``key`` lies in, the environment's without one.
+    """Batch size of the group (of agents, say) that contains ``key``, else of the environment.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -40,7 +40,7 @@ def group_shape(env: EnvBase, key: NestedKey) -> torch.Size:
 
 
 def set_leaf(spec: Composite, key: NestedKey, leaf: TensorSpec, env: EnvBase) -> None:
-    """Declare a leaf; groups that ``spec`` lacks get the batch size that they have elsewhere."""
+    """Declare a leaf; groups missing from ``spec`` get their batch size in the environment."""
     path = (key,) if isinstance(key, str) else key
     for depth in range(1, len(path)):
         group = unravel_key(path[:depth])
@@ -57,16 +57,16 @@ def set_where_reset(
     key: NestedKey,
     fresh: Tensor,
 ) -> TensorDictBase:
-    """Set ``fresh`` where the group of ``key`` begins a new episode, and what is there elsewhere.
+    """Set ``fresh`` where the group of ``key`` begins a new episode; keep the old value elsewhere.
 
-    At a native autoreset nobody else merges by the reset mask.
+    At a native autoreset TorchRL does not merge by the reset mask.
     """
     reset = expand_as_right(_group_reset(env, tensordict, key), fresh)
     return tensordict_reset.set(key, torch.where(reset, fresh, tensordict.get(key)))
 
 
 def _group_reset(env: EnvBase, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Which elements of the group of ``key`` begin a new episode, a mask of the group's shape."""
+    """Mask, of the group's shape, of the elements in ``key``'s group that begin a new episode."""
     path = (key,) if isinstance(key, str) else key
     own = [
         reset_key
@@ -79,7 +79,7 @@ def _group_reset(env: EnvBase, tensordict: TensorDictBase, key: NestedKey) -> Te
 
 
 def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
-    """A key beside ``key`` for what ``owner`` alone reads; collectors leave it out of batches.
+    """A key beside ``key`` that only ``owner`` reads; collectors leave it out of batches.
 
     Examples:
         >>> private_key("bonus", ("agents", "observation"))
@@ -91,9 +91,9 @@ def private_key(owner: NestedKey, key: NestedKey) -> NestedKey:
 
 
 def check_network(name: str, network: object, reads: Sequence[str], writes: str) -> None:
-    """Refuse a network that has no keys, or more or fewer than a transform hands it.
+    """Check that a network has an in-key for each of ``reads``, and one out-key.
 
-    In an error its name is ``name``; ``reads`` and ``writes`` say in words what it must.
+    Errors call the network ``name`` and its out-key ``writes``.
     """
     if not (hasattr(network, "in_keys") and hasattr(network, "out_keys")):
         raise TypeError(
@@ -108,7 +108,7 @@ def check_network(name: str, network: object, reads: Sequence[str], writes: str)
 
 
 class SoleWriter(Transform):
-    """A transform that is refused where something else writes its out-keys."""
+    """A transform that cannot be attached where something else writes its out-keys."""
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         refuse_shared_keys(self, output_spec, self.out_keys)
@@ -127,12 +127,12 @@ class SoleWriter(Transform):
 def refuse_shared_keys(
     transform: Transform, output_spec: Composite, keys: Iterable[NestedKey]
 ) -> None:
-    """Raise if a key is in the spec already, or if a transform that comes later writes it too.
+    """Raise if a key is already in the spec, or if a later transform also writes it.
 
-    A later transform may rewrite what it reads, as scalings and normalizations do.
+    A later transform may rewrite keys that it reads, as scalings and normalizations do.
 
     Raises:
-        ValueError: naming the key and who writes it.
+        ValueError: with the key and its other writer.
     """
     name = type(transform).__name__
     cure = f"give one of them another key, such as {name}(..., out_key=...)."
@@ -156,7 +156,7 @@ def refuse_shared_keys(
 
 
 def _groups(spec: Composite, key: tuple[str, ...]) -> Iterator[Composite]:
-    """The nodes of a spec on the way to ``key``."""
+    """Nodes of a spec on the path to ``key``."""
     for name in key[:-1]:
         if not isinstance(spec, Composite) or name not in spec.keys():
             return
@@ -170,7 +170,7 @@ def _writes(transform: Transform) -> set[NestedKey]:
 
 
 def _later(transform: Transform) -> Iterator[Transform]:
-    """Those after it in its ``Compose``; the ones before it have declared their keys."""
+    """Transforms after this one in its ``Compose``; those before it have declared their keys."""
     reference = transform.__dict__.get("_container")
     container = reference() if reference is not None else None
     if isinstance(container, Compose):

@@ -1,4 +1,4 @@
-"""A latent space as the action space: a module decodes what the policy writes for the env."""
+"""A latent space as the action space: a module decodes the policy's actions for the env."""
 
 from __future__ import annotations
 
@@ -34,54 +34,52 @@ class LatentAction(ModuleTransform):
     """Lets a policy act in the latent space of a module that decodes actions.
 
     The action spec of the transformed env is ``latent_spec``; at each step the inverse pass runs
-    the module on the latent action and the env executes what comes out, without gradients.
+    the module on the latent action and the env executes its output, without gradients.
 
-    In a collector's batches root ``latent`` and root ``action`` belong together, as they would if
-    the policy ended in the module, and stay together under n-step returns. What the simulator
-    executed in the end, after clips and scalings between it and this transform, is
-    ``("next", "executed_action")``; root ``executed_action`` is that of the step before.
+    In a collector's batches root ``latent`` and root ``action`` are a matching pair, as if the
+    policy ended in the module, also with n-step returns. ``("next", "executed_action")`` is what
+    the simulator executed, after clips and scalings between it and this transform. Root
+    ``executed_action`` is from the previous step.
 
     ``env.step``, ``env.rollout`` and the workers of ``SerialEnv`` and ``ParallelEnv`` cannot write
-    to the root, and leave ``action`` out. There the pair is root ``latent`` and
-    ``("next", "executed_action")``, and before n-step returns
-    ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)`` brings it to
-    the root. A replay buffer that several collectors share, or that a rollout is first put into,
-    has no root ``action`` either: without n-step returns, append the same transform to it.
+    to the root, so ``action`` is missing. There the pair is root ``latent`` and
+    ``("next", "executed_action")``. Before n-step returns, copy the latter to the root with
+    ``RenameTransform([("next", "executed_action")], ["action"], create_copy=True)``. A replay
+    buffer that several collectors share, or whose first data is a rollout, has no root ``action``
+    either; without n-step returns, append the same transform to it.
 
     The module is held by reference: changing its weights in place changes the next step. It is a
-    submodule, so ``state_dict()`` holds it and attaching moves it to the env's device and to eval
-    mode, as TorchRL does with every module; give a copy where the learner trains its own. In
+    submodule, so it is in ``state_dict()``, and attaching moves it to the env's device and to eval
+    mode, as TorchRL does with every module. Pass a copy if a learner trains the original. In
     another process the module is the copy made when the worker started.
 
-    Replay buffers call a transform's inverse on ``extend``; attached to one, LatentAction would
-    overwrite recorded actions, so it refuses.
+    LatentAction refuses a replay buffer. Buffers call the inverse of a transform on ``extend``,
+    which would overwrite recorded actions.
 
     Args:
-        module (TensorDictModuleBase): reads one latent action and writes one action, which keeps
-            to the bounds of the env's.
-        latent_spec (TensorSpec): of one latent action, unbatched: what the policy is to write.
+        module (TensorDictModuleBase): reads one latent action and writes one action within the
+            env's bounds.
+        latent_spec (TensorSpec): unbatched spec of one latent action, the policy's output.
 
     Keyword Args:
-        latent_key (NestedKey): what the policy writes. ``"action"`` serves policies that know no
-            other key; the recorded ``"action"`` is then the latent one. Default: ``"latent"``.
+        latent_key (NestedKey): key that the policy writes. Use ``"action"`` for policies that can
+            write no other; the recorded ``"action"`` is then the latent one. Default: ``"latent"``.
         executed_key (NestedKey): where the executed action is recorded.
             Default: ``"executed_action"``.
         action_key (NestedKey, optional): the base env's action. Default: the module's out-key.
-        decoded_key (NestedKey, optional): where a collector's batch has the decoded action.
-            Default: ``action_key``, and ``"decoded_action"`` beside it where the latent one is
-            there.
+        decoded_key (NestedKey, optional): key of the decoded action in a collector's batch.
+            Default: ``action_key``, or ``"decoded_action"`` beside it if that is the latent's key.
 
     Keys:
-        reads ``latent`` [*, d] of ``latent_spec``; writes ``("next", "executed_action")``, of the
-        base env's action spec, at reset ``executed_action``, zeros brought into the bounds, and,
-        under a collector, ``action`` [*, n]. In a group of agents all of them lie in the group, if
-        their keys say so.
+        reads ``latent`` [*, d] of ``latent_spec``; writes ``("next", "executed_action")`` of the
+        base env's action spec, ``executed_action`` at reset (zeros clamped to the bounds) and,
+        under a collector, ``action`` [*, n]. For a group of agents, give keys inside the group.
 
     Raises:
-        TypeError: if the module lacks keys, or the transform meets a replay buffer.
+        TypeError: if the module lacks keys, or the transform is put on a replay buffer.
         ValueError: if keys collide; when attached to an env, if the env has no such action key or
             the module's actions have another shape.
-        RuntimeError: if called forward: there is no way back from actions here.
+        RuntimeError: if called forward: it does not encode actions.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
@@ -138,8 +136,8 @@ class LatentAction(ModuleTransform):
 
     @property
     def _decoded_copy(self) -> NestedKey:
-        # Seen by ``_step`` only. The action key will not do: an inner transform, such as an action
-        # scaling, rewrites it on the way to the env.
+        # Read by ``_step`` only. It cannot be the action key, which inner transforms such as an
+        # action scaling rewrite on the way to the env.
         return private_key(self.executed_key, self.decoded_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -178,8 +176,8 @@ class LatentAction(ModuleTransform):
         # ``tensordict`` is the copy that the inverse passes of all transforms worked on.
         decoded = tensordict.get(self._decoded_copy)
         if isinstance(self.collector, Collector):
-            # The copy's root is lost, and so is that of the step where a collector takes data from
-            # device to device; this is the one that it stores.
+            # The copy's root is lost, as is the step's where a collector moves data between
+            # devices. The carrier is what the collector stores.
             self.collector._carrier.set(self.decoded_key, decoded)
         executed = decoded if self._base_key is None else tensordict.get(self._base_key)
         return next_tensordict.set(self.executed_key, executed.to(self._executed_leaf.dtype))
@@ -201,12 +199,12 @@ class LatentAction(ModuleTransform):
         return set_where_reset(self.parent, tensordict, tensordict_reset, self.executed_key, rest)
 
     def rest(self, batch_size: torch.Size) -> Tensor:
-        """What counts as executed before the first step: zeros brought into the bounds."""
+        """Executed action before the first step, by convention: zeros clamped to the bounds."""
         leaf = self._executed_leaf
         rest = leaf.zero()
         if isinstance(leaf, Bounded):
             rest = rest.clamp(leaf.space.low, leaf.space.high)
-        # An env that is not batch-locked leaves the batch size to the data.
+        # Without a batch lock, the batch size comes from the data.
         return rest.expand((*batch_size, *rest.shape[self.parent.ndim :])).clone()
 
     @property
@@ -219,7 +217,7 @@ class LatentAction(ModuleTransform):
 
     @property
     def _base_key(self) -> NestedKey | None:
-        """The simulator's name for the action, or None where that is not known."""
+        """The base env's key of the action, or None if it is not known."""
         keys = self.parent.base_env.action_keys
         if self.action_key in keys:
             return self.action_key
@@ -235,7 +233,7 @@ class LatentAction(ModuleTransform):
         batch_size = self._batch_size(leaf)
         latent_spec = self.latent_spec.expand((*batch_size, *self.latent_spec.shape))
         latent_spec = latent_spec.to(leaf.device or latent_spec.device)
-        # In this order: a group that were empty for a moment would lose its batch size.
+        # Set before deleting: a group that is empty in between would lose its batch size.
         set_leaf(action_spec, self.latent_key, latent_spec, self.parent)
         return (
             action_spec
@@ -266,7 +264,7 @@ class LatentAction(ModuleTransform):
             raise
 
     def train(self, mode: bool = True) -> LatentAction:
-        # A ready-made Compose passed to a buffer is not re-attached, but it is put in eval mode.
+        # A buffer does not re-attach a ready-made Compose, but it puts it in eval mode.
         _refuse_replay_buffer(type(self).__name__)
         return super().train(mode)
 
@@ -307,7 +305,7 @@ class LatentAction(ModuleTransform):
 
 
 def _without(spec: Composite, key: NestedKey) -> Composite:
-    """``spec`` less one leaf, and less the nodes that it leaves empty."""
+    """``spec`` without one leaf, and without nodes that are empty then."""
     del spec[key]
     while not isinstance(key, str) and spec[key[:-1]].is_empty():
         key = unravel_key(key[:-1])
@@ -316,12 +314,12 @@ def _without(spec: Composite, key: NestedKey) -> Composite:
 
 
 def _refuse_replay_buffer(name: str) -> None:
-    # A buffer tells its transforms nothing: it puts them in a Compose without an env, which is
-    # also what every env pipeline is before it is attached. The caller is the only difference.
+    # A buffer puts its transforms in a Compose without an env, just as an env pipeline is before it
+    # is attached. Only the caller tells the two apart.
     frame = sys._getframe(1)
     while frame is not None:
-        # ``issubclass``, because TorchRL's ``isinstance`` hook queries attributes of its argument
-        # and half-built envs among the callers do not survive that.
+        # ``issubclass``, because TorchRL's ``isinstance`` hook queries attributes of its argument,
+        # which fails on half-built envs among the callers.
         if issubclass(type(frame.f_locals.get("self")), ReplayBuffer):
             raise TypeError(
                 f"{name} cannot be attached to a replay buffer, because buffers call the "

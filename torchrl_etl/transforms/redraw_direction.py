@@ -1,4 +1,4 @@
-"""Other directions for transitions that have been collected."""
+"""Relabeling of collected transitions with other directions."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ __all__ = ["RedrawDirection"]
 
 
 class RedrawDirection(Transform):
-    """Draws the directions of sampled transitions anew.
+    """Relabels sampled transitions with newly drawn directions.
 
-    Eq. 1 rewards any transition along any direction, so an off-policy learner can ask of each what
-    it would have been worth to an episode that went another way, as hindsight replay asks of
-    goals. A few thousand frames hold some dozens of directions, and every transition is then worth
-    one for all of them.
+    Eq. 1 rewards any transition along any direction. An off-policy learner can therefore learn for
+    directions that were not followed, as hindsight experience replay does for goals. A few thousand
+    frames follow only dozens of directions; relabeled transitions serve any direction.
 
-    Goes on a replay buffer, before :class:`IntrinsicReward` if that is there too, or is called on a
-    tensordict of transitions, of any batch size. What the buffer holds is not changed.
+    Append it to a replay buffer, before :class:`IntrinsicReward` if both are used, or call it on
+    transitions of any batch size. The buffer's contents are not changed.
 
-    Deviates: Algorithm 1 learns from the direction that was followed; ``share=0`` is the print.
+    Deviates: Algorithm 1 learns from the direction that was followed; ``share=0`` is as printed.
 
     Args:
-        primer (DirectionPrimer): says which directions there are, and under which key.
+        primer (DirectionPrimer): draws the directions and names their key.
 
     Keyword Args:
         share (float): probability that a transition gets a new direction, in [0, 1]. Default: 1.
 
     Keys:
-        rewrites ``direction`` [*, k] and ``("next", "direction")``, both alike.
+        rewrites ``direction`` [*, k] and ``("next", "direction")`` with the same direction.
 
     Raises:
-        ValueError: if the share lies outside of [0, 1].
-        RuntimeError: in an environment, where :class:`DirectionPrimer` is the one that draws.
+        ValueError: if the share is outside [0, 1].
+        RuntimeError: in an environment, where :class:`DirectionPrimer` draws directions.
 
     Examples:
         >>> import torch
@@ -63,7 +62,7 @@ class RedrawDirection(Transform):
                 f"RedrawDirection reads {key!r} at both ends of a transition; beside what is "
                 f"missing are {sorted(map(str, tensordict.keys(True, True)))}."
             )
-        shape = followed.shape[:-1]  # in a group of agents, each of them
+        shape = followed.shape[:-1]  # in a group of agents, one each
         drawn = self.primer.draw(shape, followed.device)
         again = torch.rand(shape, device=followed.device) < self.share
         direction = torch.where(expand_as_right(again, drawn), drawn, followed)

@@ -1,4 +1,4 @@
-"""The bonus of random network distillation, on environments, buffers and tensordicts alike."""
+"""The bonus of random network distillation for environments, buffers and tensordicts."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ __all__ = ["RNDBonus"]
 class RNDBonus(ScaledBonus):
     """Rewards observations whose random features are not yet predicted (RND, Burda 2018).
 
-    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer or in
-    a learner, where every *sampled* batch gets the error of the predictor as it is by then, and on
-    a tensordict. The error is that of TorchRL's loss, whose networks and statistics are held by
-    reference; they belong to whoever trains and saves the loss. A call takes the observations that
-    it sees into the loss's statistics first. TorchRL's own ``RNDTransform`` is for environments
-    alone, see ``docs/torchrl_notes.md``.
+    Like :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, a tensordict, a replay
+    buffer or in a learner; the last two give every *sampled* batch the current predictor's error.
+    TorchRL's loss computes the error. Its networks and statistics are held by reference and not
+    saved here. Each call first updates the loss's statistics with its observations. TorchRL's own
+    ``RNDTransform`` is for environments alone, see ``docs/torchrl_notes.md``.
 
     Equation: b = mean_j (f_j(ō') - g_j(ō'))² with the random target g, its predictor f, and ō the
-    observation in deviations from the mean of those so far, clipped.
+    observation normalized by its running mean and deviation, clipped.
 
-    Deviates: the paper divides by the deviation of the discounted sum of bonuses and has critics
-    for bonus and reward each, the bonus's without ends of episodes. Here the bonus is divided by
-    its own running deviation, as :class:`~torchrl_etl.transforms.IntrinsicReward`'s, and one
-    critic has both.
+    Deviates: the paper divides by the deviation of the discounted sum of bonuses and has separate
+    critics for bonus and reward, the bonus's without ends of episodes. Here the bonus is divided by
+    its own running deviation, as in :class:`~torchrl_etl.transforms.IntrinsicReward`, and the same
+    critics value both.
 
     Args:
-        loss (RNDLoss): what trains the predictor.
+        loss (RNDLoss): the loss that trains the predictor.
 
     Keyword Args:
         in_key (NestedKey): the observation. Default: ``"observation"``.
@@ -78,7 +77,7 @@ class RNDBonus(ScaledBonus):
             reduction="none",
             update_fraction=1.0,
         )
-        # In a tuple it is no submodule: as such it would follow the env's device, be saved twice.
+        # In a tuple, since a submodule would follow the env's device and be saved twice.
         self._error = (error,)
 
     @property
@@ -93,7 +92,7 @@ class RNDBonus(ScaledBonus):
         self, observation: Tensor, next_observation: Tensor, tensordict: TensorDictBase
     ) -> Tensor:
         (error,) = self._error
-        # Under SideBySide, stacks stand in for parameters and are none.
+        # SideBySide replaces parameters by stacked tensors, so there may be none.
         seen = next_observation.to(next(error.parameters(), next_observation).device)
         if error.obs_rms is not None and self.update_statistics:
             error.obs_rms.update(seen)

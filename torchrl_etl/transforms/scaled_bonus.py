@@ -1,4 +1,4 @@
-"""A bonus and the task's reward, each in units of its own deviation."""
+"""A bonus plus the task's reward, each divided by its running deviation."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ class ScaledBonus(TransitionReward):
     A subclass computes the bonus in ``_bonus``.
 
     Args:
-        in_keys (sequence of NestedKey): what the bonus is made of; the first is the observation.
-        out_key (NestedKey): where it goes, below ``"next"``.
+        in_keys (sequence of NestedKey): inputs of the bonus; the first is the observation.
+        out_key (NestedKey): key of the sum, below ``"next"``.
 
     Keyword Args:
         normalize (bool): divide bonus and task reward by their running standard deviations.
             Default: ``True``.
-        decay (float): in (0, 1); a call (one env step or one sampled batch) weighs ``1 - decay`` in
-            the running statistics. Default: 0.99.
+        decay (float): in (0, 1); a call (one env step or one sampled batch) has weight
+            ``1 - decay`` in the running statistics. Default: 0.99.
         extrinsic_weight (float): weight of the task's reward. Default: 0.
         reward_key (NestedKey): the task's reward, read where ``extrinsic_weight`` is not 0.
             Default: ``"reward"``.
-        update_statistics (bool): whether calls update the running statistics; an attribute of the
-            same name can be set at any time, in a compiled learner before its first update. It does
-            not depend on train and eval mode, since TorchRL puts transforms of envs and buffers in
-            eval mode. Default: ``True``.
+        update_statistics (bool): whether calls update the running statistics. The attribute can be
+            set at any time; in a compiled learner, before its first update. Train and eval mode
+            have no effect, since TorchRL puts transforms of envs and buffers in eval mode.
+            Default: ``True``.
 
     Raises:
         ValueError: if ``decay`` is used and outside (0, 1), or ``extrinsic_weight`` is negative.
@@ -67,7 +67,7 @@ class ScaledBonus(TransitionReward):
     def _bonus(
         self, observation: Tensor, next_observation: Tensor, tensordict: TensorDictBase
     ) -> Tensor:
-        """The bonus [*, 1] as it is; the tensordict is that of the root."""
+        """The bonus [*, 1] before scaling; ``tensordict`` is the root."""
 
     @torch.no_grad()
     def _rewards(

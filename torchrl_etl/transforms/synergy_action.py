@@ -16,31 +16,31 @@ __all__ = ["SynergyAction"]
 class SynergyAction(LatentAction):
     """Lets a policy act through a synergy decoder.
 
-    A :class:`~torchrl_etl.transforms.LatentAction` that knows what a decoder says of itself: the
-    policy acts in its ``synergy_spec``, and a body with other actuators or bounds is refused.
+    A :class:`~torchrl_etl.transforms.LatentAction` whose latent space is the decoder's
+    ``synergy_spec``. It refuses an env with other actuators or bounds than the decoder's.
 
     Equation: a = Dec(z^a) of section 4.2.
 
     Args:
-        decoder (TensorDictModuleBase): one in-key, one out-key and the attributes ``synergy_spec``
+        decoder (TensorDictModuleBase): has one in-key, one out-key, and ``synergy_spec``
             (unbatched), ``action_dim``, ``low`` and ``high`` of
             :class:`~torchrl_etl.modules.SynergyDecoder`.
 
     Keyword Args:
-        synergy_key (NestedKey): what the policy writes. ``"action"`` serves policies that know no
-            other key; the recorded ``"action"`` is then the synergy. Default: ``"synergy"``.
+        synergy_key (NestedKey): key that the policy writes. Use ``"action"`` for policies that can
+            write no other; the recorded ``"action"`` is then the synergy. Default: ``"synergy"``.
         executed_key, action_key, decoded_key (NestedKey, optional): see
             :class:`~torchrl_etl.transforms.LatentAction`.
 
     Keys:
-        those of :class:`~torchrl_etl.transforms.LatentAction`: ``synergy`` [*, d] in [-1, 1],
+        as in :class:`~torchrl_etl.transforms.LatentAction`, with ``synergy`` [*, d] in [-1, 1] and
         ``action`` [*, n] in [low, high].
 
     Raises:
-        TypeError: if the decoder lacks keys or attributes, or the transform meets a replay buffer.
+        TypeError: if the decoder lacks keys or attributes, or the transform is put on a buffer.
         ValueError: if keys collide; when attached to an env, if the env has no such action key or
             its number of actuators or bounds are not the decoder's.
-        RuntimeError: if called forward: there is no way back from actions to synergies here.
+        RuntimeError: if called forward: it does not encode actions.
 
     Examples:
         >>> import torch
@@ -84,14 +84,14 @@ class SynergyAction(LatentAction):
 
     @property
     def synergy_key(self) -> NestedKey:
-        """What the policy writes."""
+        """Key that the policy writes."""
         return self.latent_key
 
     def decode(self, latent: Tensor) -> Tensor:
         action = super().decode(latent)
         if self.parent is None or not isinstance(leaf := self._action_leaf, Bounded):
             return action
-        # In single precision, bounds are rounded too; those of all rows are the decoder's.
+        # Bounds are rounded to single precision too; every row has the decoder's.
         row = (0,) * (leaf.ndim - 1)
         return action.clamp(leaf.space.low[row], leaf.space.high[row])
 
@@ -130,7 +130,7 @@ class SynergyAction(LatentAction):
 
 
 def _interval(low: Tensor, high: Tensor) -> str:
-    """The bounds of all actuators if they share them, else the widest."""
+    """Text of the actuators' bounds if all share them, else of the widest."""
     return f"[{low.min().item():g}, {high.max().item():g}]" + (
         "" if (low == low.min()).all() and (high == high.max()).all() else " at the widest"
     )

@@ -1,4 +1,4 @@
-"""Rewards of whole transitions, on environments, buffers and tensordicts alike."""
+"""Rewards of whole transitions for environments, buffers and tensordicts."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ __all__ = ["TransitionReward", "evaluate"]
 
 
 class TransitionReward(SoleWriter):
-    """Writes rewards below ``"next"`` that depend on both ends of a step.
+    """Writes rewards below ``"next"`` that depend on both ends of a transition.
 
-    The first in-key is the observation that is compared. In an environment, transforms behind this
-    one may rewrite it (a normalization, say, perhaps in another process), and then the root of a
-    step and what arrives below ``"next"`` are not of one kind. So the transform carries a copy of
-    its own from reset to step, under a private key, which collectors leave out of their batches.
+    The first in-key is the observation at both ends. In an environment, later transforms may
+    rewrite it (a normalization, say, perhaps in another process). Then the root of a step and its
+    ``"next"`` would not be comparable. So the transform carries its own copy from step to step,
+    under a private key that collectors leave out of batches.
 
-    A subclass computes the rewards in ``_rewards``, one for each out-key. They are declared as
-    [*, 1], of the dtype of ``_typed_by``.
+    A subclass computes one reward for each out-key in ``_rewards``. Rewards are declared as [*, 1]
+    with the dtype of ``_typed_by``.
     """
 
     _cure: str
-    """How to mend that an observation is missing in an environment."""
+    """Remedy in the error about an observation that an environment lacks."""
 
     @property
     def networks(self) -> Sequence[nn.Module]:
-        """What it reads and does not hold, since others train and save it."""
+        """Networks that it reads but does not own: others train and save them."""
         return ()
 
     @property
     def _carried(self) -> Sequence[NestedKey]:
-        """In-keys besides the first that are observations."""
+        """In-keys, besides the first, that the env's state spec must contain."""
         return ()
 
     @property
     @abstractmethod
     def _typed_by(self) -> NestedKey:
-        """An observation or a reward whose dtype the rewards have."""
+        """Observation or reward whose dtype and device the rewards have."""
 
     @abstractmethod
     def _rewards(
@@ -90,7 +90,7 @@ class TransitionReward(SoleWriter):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self._leaf(self.in_keys[0])  # raises with a cure if the environment has no such key
+        self._leaf(self.in_keys[0])  # raises if the environment has no such key
         return self._keep(tensordict_reset)
 
     def _reset_on_native_autoreset(
@@ -108,8 +108,8 @@ class TransitionReward(SoleWriter):
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite | None) -> Composite:
-        # A parallel env hands its workers the action and what the state spec names, no more:
-        # without these entries a worker would take the root of its own last step for the caller's.
+        # A parallel env sends its workers only the action and the entries of the state spec.
+        # Without these, a worker would use the root of its own last step, not the caller's.
         if state_spec is None:
             state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
         set_leaf(state_spec, self._copy_key, self._leaf(self.in_keys[0]).clone(), self.parent)
@@ -139,7 +139,7 @@ class TransitionReward(SoleWriter):
 
 
 def evaluate(network: TensorDictModuleBase, *inputs: Tensor) -> Tensor:
-    """The network's output for bare tensors, computed on the network's own device and dtype."""
+    """The network's output for plain tensors, computed on the network's device and dtype."""
     weight = next(iter(network.parameters()), inputs[0])
     entries = {key: value.to(weight) for key, value in zip(network.in_keys, inputs, strict=True)}
     written = network(TensorDict(entries, inputs[0].shape[:-1], device=weight.device))
