@@ -1,9 +1,9 @@
-"""Equations 1-10 of Explore to Learn, and what else is mathematics, as pure tensor functions.
+"""Equations 1-10 of Explore to Learn, and other mathematics, as pure functions of tensors.
 
-No keys, no modules, no state: tensors in, tensors out. Every function works on any number of
-leading batch dimensions (written ``*``), and none of them reduces over the batch: that is left to
-the caller. Symbols: ``n`` actuators, ``d`` synergies, ``k`` embedding dimensions, ``C`` mixture
-components.
+They have no keys, modules or state, and accept any number of leading batch dimensions (written
+``*``). Reduction over the batch is left to the caller, except in
+:func:`~torchrl_etl.functional.effective_rank`. Symbols: ``n`` actuators, ``d`` synergies, ``k``
+embedding dimensions, ``C`` mixture components.
 """
 
 from torchrl_etl.functional.categorical import (

@@ -20,14 +20,14 @@ def categorical_mean(logits: Tensor, support: Tensor) -> Tensor:
 
 
 def project_categorical(probabilities: Tensor, atoms: Tensor, support: Tensor) -> Tensor:
-    """Distributions on atoms [*, K] brought onto the support [M], [*, M].
+    """Project distributions on atoms [*, K] onto the support [M]; returns probabilities [*, M].
 
-    Each atom is clipped to the support's ends; its probability goes to its two neighbours, in
-    proportion to nearness, so that within the ends the mean is kept.
+    Each atom is clipped to the support. Its probability is split between its two neighbors in
+    proportion to nearness, which keeps the mean unless atoms are clipped.
 
     Args:
         probabilities (Tensor): of the atoms, [*, K].
-        atoms (Tensor): where they lie, [*, K].
+        atoms (Tensor): positions of the atoms, [*, K].
         support (Tensor): evenly spaced, ascending, [M].
 
     Examples:

@@ -1,4 +1,4 @@
-"""Latent exploration (Eqs. 1-6): the bonus, the behavioral metric, and what keeps it honest."""
+"""Latent exploration (Eqs. 1-6): bonus, behavioral metric, its regularizer and diagnostics."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ __all__ = [
     "mico_distance",
 ]
 
-# Inside a square root: small enough not to be seen in float32 distances, large enough that the
-# gradient of the root at zero is zero instead of NaN.
+# Added inside square roots: too small to show in float32 distances, large enough that the gradient
+# of the root at zero is zero instead of NaN.
 EPS = 1e-12
 
 
@@ -79,9 +79,9 @@ def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> 
 
     .. math:: U(x, y) = \tfrac12 (\|x\|^2 + \|y\|^2) + \beta\,\angle(x, y)
 
-    A state's distance to itself is :math:`\|x\|^2`, not zero: this is a *diffuse* metric, made for
-    a divergence estimated from independent samples, whose value for a state paired with itself is
-    not zero either.
+    This is a *diffuse* metric: a state's distance to itself is :math:`\|x\|^2`, not zero. It suits
+    a divergence estimated from independent samples, which is not zero for a state and itself
+    either.
 
     Args:
         x, y (Tensor): embeddings, ``[*, k]``.
@@ -102,7 +102,7 @@ def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> 
     x_square, y_square = x.square().sum(-1), y.square().sum(-1)
     x_unit = x / (x_square + eps).sqrt().unsqueeze(-1)
     y_unit = y / (y_square + eps).sqrt().unsqueeze(-1)
-    # Half-angle form: accurate, and finite in its gradient, at 0 and at pi where arccos is not.
+    # Half-angle form: accurate and with finite gradients at 0 and pi, where arccos is neither.
     angle = 2 * torch.atan2(l2_distance(x_unit, y_unit, eps), l2_distance(x_unit, -y_unit, eps))
     return 0.5 * (x_square + y_square) + beta * angle
 
@@ -116,7 +116,7 @@ def gaussian_w2(
 
     Args:
         mean_i, std_i (Tensor): mean and standard deviation of the first, ``[*, k]``.
-        mean_j, std_j (Tensor): those of the second, ``[*, k]``.
+        mean_j, std_j (Tensor): mean and standard deviation of the second, ``[*, k]``.
         eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
 
     Returns:
@@ -142,7 +142,7 @@ def metric_target(reward_i: Tensor, reward_j: Tensor, divergence: Tensor, gamma:
 
     Args:
         reward_i, reward_j (Tensor): rewards of the first and of the second states, ``[*]``.
-        divergence (Tensor): distance between what follows, ``[*]``. A loss passes it detached.
+        divergence (Tensor): divergence of the next states, ``[*]``. A loss passes it detached.
         gamma (float): discount factor.
 
     Returns:
@@ -230,7 +230,7 @@ def discriminability(
         reward_i, reward_j (Tensor): rewards of the first and of the second states, ``[*]``.
         embedding_i, embedding_j (Tensor): their embeddings, ``[*, k]``.
         epsilon (float): pairs whose rewards differ by less than this are regularized.
-        margin (float, optional): distance beyond which the hinge is silent; not read by
+        margin (float, optional): distance from which the hinge is zero; not used by
             ``"literal"``. Defaults to ``1.0``.
         form (str, optional): ``"hinge"`` or ``"literal"``. Defaults to ``"hinge"``.
 
@@ -270,13 +270,13 @@ def discriminability(
 
 
 def effective_rank(embedding: Tensor) -> Tensor:
-    r"""Number of embedding dimensions in real use: participation ratio of the variances.
+    r"""Effective number of embedding dimensions: participation ratio of the variances.
 
     .. math:: (\operatorname{tr} C)^2 / \operatorname{tr} C^2, \qquad C \text{ the covariance}
 
-    Not in the paper; a collapsed encoder shows here before it shows in the return. It measures
-    shape and not size, so read it beside the mean distance. It takes no decomposition, so it is
-    cheap beside every update and can be part of a CUDA graph.
+    Not in the paper. It shows a collapsed encoder before the return does. It does not depend on
+    scale, so read it with the mean distance. It needs no matrix decomposition, so it is cheap at
+    every update and can be part of a CUDA graph.
 
     Args:
         embedding (Tensor): embeddings, ``[*, k]``; all leading dimensions count as samples.

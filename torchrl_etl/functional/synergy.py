@@ -46,7 +46,7 @@ def gaussian_kl(loc_q: Tensor, scale_q: Tensor, loc_p: Tensor, scale_p: Tensor) 
 
     Args:
         loc_q, scale_q (Tensor): means and standard deviations of ``q``, ``[*, d]``.
-        loc_p, scale_p (Tensor): those of ``p``, broadcastable to ``[*, d]``.
+        loc_p, scale_p (Tensor): means and deviations of ``p``, broadcastable to ``[*, d]``.
 
     Returns:
         Tensor: divergences in nats, ``[*]``.
@@ -197,7 +197,7 @@ def gmvae_bound(
 
 
 def reconstruction_loss(decoded: Tensor, action: Tensor) -> Tensor:
-    r"""Squared error between a decoded synergy and the action it stood for.
+    r"""Squared error between a decoded synergy and its recorded action.
 
     .. math:: |\mathrm{Dec}(z) - a|^2
 

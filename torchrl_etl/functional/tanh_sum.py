@@ -1,4 +1,4 @@
-"""A sum that stays within its bounds: a residual on a bounded action."""
+"""A sum that stays within bounds, to add a residual to a bounded action."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ __all__ = ["tanh_sum", "tanh_sum_log_slope"]
 def tanh_sum(x: Tensor, y: Tensor) -> Tensor:
     r"""Add before the bounds: :math:`\tanh(\tanh^{-1} x + \tanh^{-1} y) = (x + y) / (1 + xy)`.
 
-    For every x it maps y from (-1, 1) onto (-1, 1), so that no y is without effect. A sum that is
-    clamped to its bounds has no gradient beyond them.
+    For every x in (-1, 1) it maps y from (-1, 1) onto (-1, 1), so every y has an effect. A sum
+    clamped to its bounds would have no gradient beyond them.
 
     Args:
         x, y (Tensor): in [-1, 1], not opposite ends of it, broadcastable to ``[*]``.
@@ -29,7 +29,7 @@ def tanh_sum(x: Tensor, y: Tensor) -> Tensor:
 
 
 def tanh_sum_log_slope(x: Tensor, y: Tensor) -> Tensor:
-    r"""How far :func:`tanh_sum` moves with y, :math:`\ln \partial / \partial y`.
+    r"""Log of the derivative of :func:`tanh_sum` by y, :math:`\ln \partial / \partial y`.
 
     .. math:: \ln \frac{1 - x^2}{(1 + xy)^2}
 
@@ -38,7 +38,7 @@ def tanh_sum_log_slope(x: Tensor, y: Tensor) -> Tensor:
         y (Tensor): in [-1, 1], broadcastable to ``[*]``.
 
     Returns:
-        Tensor: ``[*]``; zero where x is.
+        Tensor: ``[*]``; zero where x is zero.
 
     Examples:
         >>> import torch
@@ -50,8 +50,8 @@ def tanh_sum_log_slope(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _sides(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """(1 + x)(1 + y) and (1 - x)(1 - y): x + y and 1 + xy are halves of their difference and sum.
+    """(1 + x)(1 + y) and (1 - x)(1 - y): half their difference is x + y, half their sum 1 + xy.
 
-    None of these is negative, so that rounding leads to no sum beyond the bounds.
+    Neither is negative, so rounding cannot move the result beyond the bounds.
     """
     return (1 + x) * (1 + y), (1 - x) * (1 - y)
