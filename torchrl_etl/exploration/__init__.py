@@ -1,4 +1,4 @@
-"""Ways for stage 1 to explore, one a file."""
+"""Exploration methods of stage 1, one per file."""
 
 from collections.abc import Mapping
 
@@ -26,4 +26,4 @@ EXPLORATIONS: Mapping[str, type[Exploration]] = {
     "rnd": RNDExploration,
     "noise": NoiseExploration,
 }
-"""Kinds of exploration by name; ``"my_module:MyExploration"`` names one's own."""
+"""Exploration classes by name; ``"my_module:MyExploration"`` names a custom one."""

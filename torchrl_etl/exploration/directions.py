@@ -20,10 +20,10 @@ __all__ = ["DirectionExploration"]
 
 
 class DirectionExploration(Exploration):
-    """Each episode follows a direction z; moving the embedding φ along it is rewarded.
+    """Each episode follows a direction z, with a bonus for moving the embedding φ along it.
 
-    Subclasses train φ. Sampled batches are relabelled with other directions, which Eq. 1 allows:
-    it rewards any step along any direction.
+    Subclasses train φ. Sampled batches are relabeled with other directions, since Eq. 1 rewards
+    any step along any direction.
 
     Equation: 1, r^b = ⟨φ(s') - φ(s), z⟩.
 
@@ -32,7 +32,7 @@ class DirectionExploration(Exploration):
             :class:`~torchrl_etl.modules.StateEncoder`,
             :class:`~torchrl_etl.transforms.DirectionPrimer` and
             :class:`~torchrl_etl.transforms.IntrinsicReward`.
-        relabel (float): share of each batch that is relabelled with a direction drawn anew, see
+        relabel (float): share of each batch that is relabeled with new directions, see
             :class:`~torchrl_etl.transforms.RedrawDirection`.
     """
 

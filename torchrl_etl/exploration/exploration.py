@@ -1,4 +1,4 @@
-"""What stage 1 needs to know of a way to explore."""
+"""Interface of the exploration methods of stage 1."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ __all__ = ["Exploration"]
 
 
 class Exploration:
-    """A way to explore: what is drawn at reset, what a sampled batch gets, what is trained.
+    """An exploration method: its draws at reset, changes to sampled batches, and losses.
 
-    This one is SAC on the task's reward, without anything added. Others override what differs, in
-    a file of their own that a configuration names by its kind; ``docs/extend.md`` adds one.
+    This base class is plain SAC on the task's reward. Subclasses override what differs; a
+    configuration selects one by its kind. ``docs/extend.md`` adds one.
 
     Args:
         spec (EnvironmentSpec): sizes, bounds and device of the environment.
 
     Attributes:
-        reward (NestedKey): what SAC learns on in stage 1, below ``"next"``.
-        keep (sequence of NestedKey): entries of a transition that the buffer must keep for it.
-        inputs (mapping): sizes of what actor and critics read beside the observation, by key.
-        learns (bool): whether a policy does; if not, updates train the synergy model alone.
+        reward (NestedKey): the reward that SAC maximizes in stage 1, below ``"next"``.
+        keep (sequence of NestedKey): entries of a transition that the buffer must also keep.
+        inputs (mapping): sizes of actor and critic inputs besides the observation, by key.
+        learns (bool): whether a policy is trained; if not, updates train only the synergy model.
     """
 
     reward: NestedKey = "reward"
@@ -42,18 +42,18 @@ class Exploration:
         self.inputs = {}
 
     def reset_transforms(self) -> Sequence[Transform]:
-        """For the environment: they draw what holds for an episode. Each simulator gets clones."""
+        """For the environment: they draw values for an episode. Each simulator gets clones."""
         return ()
 
     def relabel_transforms(self) -> Sequence[Transform]:
-        """For the buffer: they replace, in every sampled batch, what the policy reads."""
+        """For the buffer: they relabel the policy's inputs in every sampled batch."""
         return ()
 
     def batch_transforms(self) -> Sequence[Transform]:
-        """For the learner: what each batch gets at its update, with all networks as they then are.
+        """For the learner: applied to each batch at its update, with the current networks.
 
-        They are part of the compiled update: statistics are buffers, and networks that one reads
-        are submodules of it or in its attribute ``networks``.
+        They are part of the compiled update: statistics must be buffers, and networks that a
+        transform reads must be its submodules or in its attribute ``networks``.
         """
         return ()
 
@@ -62,9 +62,9 @@ class Exploration:
         return ()
 
     def behavior(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
-        """What collects, given the actor with its noise."""
+        """The behavior policy, given the actor with its noise."""
         return policy
 
     def embed(self, rows: TensorDictBase) -> tuple[Tensor, Tensor] | None:
-        """Embeddings [*, k] and directions [*, k] of transitions as the buffer has them, if any."""
+        """Embeddings [*, k] and directions [*, k] of transitions from the buffer, if any."""
         return None

@@ -16,7 +16,7 @@ __all__ = ["MetricExploration"]
 
 
 class MetricExploration(DirectionExploration):
-    """φ learns distances that tell states apart by the task's reward and where they lead.
+    """φ learns distances that compare states by the task's reward and their next states.
 
     Equation: 2, 3, 5 and 6, see :class:`~torchrl_etl.objectives.BehavioralMetricLoss`.
 
@@ -37,7 +37,7 @@ class MetricExploration(DirectionExploration):
         **directions: Any,
     ) -> None:
         super().__init__(spec, **directions)
-        check_real("(0, 1]", tau=tau)  # for a term without targets it may be None
+        check_real("(0, 1]", tau=tau)  # Term also allows None, for no targets
         check_flag(**{"metric.delay_encoder": metric.get("delay_encoder", True)})
         self._lr, self._tau, self._metric = lr, tau, dict(metric)
 

@@ -1,4 +1,4 @@
-"""Exploration without a policy: noise that lasts moves the muscles."""
+"""Exploration without a policy: temporally correlated noise moves the muscles."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Color = Literal["pink", "held"]
 
 
 class NoiseExploration(Exploration):
-    """No policy learns: the cheapest control of any other exploration.
+    """Acts by temporally correlated noise and trains no policy: the cheapest baseline.
 
     Keyword Args:
         color (str): ``"pink"``, see :class:`~torchrl_etl.modules.lasting_noise.PinkNormal`, or
             ``"held"``, see :class:`~torchrl_etl.modules.lasting_noise.HeldNormal`.
-        std (float): of the noise, before the bounds.
-        longest (int): time constant of the slowest part of pink noise, most steps of held noise.
-        exponent (float): of held noise.
+        std (float): standard deviation of the noise before the tanh.
+        longest (int): steps of pink noise's slowest time constant, or of held noise's longest hold.
+        exponent (float): exponent of the hold lengths, for held noise.
     """
 
     learns = False
@@ -46,17 +46,17 @@ class NoiseExploration(Exploration):
 
 
 class LastingNoise(TensorDictModuleBase):
-    """A policy that is noise, and knows nothing but where episodes begin.
+    """Policy of temporally correlated noise, which reads only where episodes begin.
 
     Equation: a = tanh(std · x) where the bounds are [-1, 1].
 
     Args:
         low, high (Tensor): bounds of the action [n].
-        draw (callable): makes the noise x [*, n] of a step out of a tensor like it and of where
-            episodes begin [*].
+        draw (callable): returns the noise x [*, n] of a step, given a tensor like it and a mask of
+            where episodes begin [*].
 
     Keyword Args:
-        std (float): its deviation before the bounds.
+        std (float): standard deviation before the tanh.
 
     Keys:
         reads ``is_init`` [*, 1]; writes ``action`` [*, n] in [low, high].

@@ -21,10 +21,10 @@ __all__ = ["RNDExploration"]
 
 
 class RNDExploration(Exploration):
-    """What was seldom seen is rewarded: its random features are predicted badly (Burda 2018).
+    """Rewards rarely seen observations, whose random features are predicted badly (Burda 2018).
 
-    The loss is TorchRL's, of whole batches: the paper masks three quarters of what many simulators
-    give at once. Nothing is drawn at reset, and the policy reads the observation alone.
+    TorchRL's loss is used on whole batches; the paper masks three quarters of the data from its
+    many simulators. Nothing is drawn at reset, and the policy reads only the observation.
 
     Equation: see :class:`~torchrl_etl.transforms.RNDBonus`.
 
