@@ -1,4 +1,4 @@
-"""ETL's rivals, each a part that other TorchRL code can use."""
+"""Baselines of ETL, as parts that other TorchRL code can use."""
 
 from torchrl_etl.baselines.dep import DEPController, DEPExploration
 from torchrl_etl.baselines.dynsyn import GroupedTanhNormal, make_dynsyn_actor, set_frames

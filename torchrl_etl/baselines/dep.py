@@ -21,11 +21,11 @@ _BIAS_STEP, _BIAS_DECAY = 0.05, 0.001
 
 
 class DEPController:
-    r"""Differential extrinsic plasticity: muscle lengths in, muscle commands out.
+    r"""Differential extrinsic plasticity: a controller from muscle lengths to muscle commands.
 
-    Muscles whose velocities went together a moment ago are driven together, so whatever the body
-    does by itself is taken up and made larger. There is nothing to train: the weights are
-    made of the latest movements. Each row is a body of its own.
+    Muscles whose recent velocities correlate are driven together, which amplifies the body's own
+    movements. Nothing is trained: the weights are computed from the latest movements. Each row is
+    a separate body.
 
     Equation: with :math:`l_{min}, l_{max}` the extremes of each length so far and :math:`M = -I`,
 
@@ -39,26 +39,25 @@ class DEPController:
         | :math:`y = \tanh(\kappa q + h)`
 
     Deviates: from the public code, which scales columns instead of rows (``normalize="columns"``; 6
-    to 10 % of commands get another sign), leaves the latest movement out of the sum (so that it has
-    two terms fewer), and takes the jump of the body to a new episode for a movement; here
-    :meth:`reset` says that it is none. Of its buffer of 200 steps only the last τ + Δ movements are
-    ever read, so no others are kept.
+    to 10 % of commands change sign), leaves the latest movement out of the sum (two terms fewer),
+    and counts the jump to a new episode as a movement. Here :meth:`reset` excludes that jump. Only
+    the last τ + Δ movements are kept; the public code buffers 200 steps but reads no others.
 
     Args:
         rows (int): number of bodies.
         num_muscles (int): number n of muscles.
 
     Keyword Args:
-        kappa (float): κ, how steep commands are. Default: 1169.7.
-        tau (int): τ, how many steps the matrix is made of. Default: 40.
-        bias_rate (float): how fast a command that lasts is worn down. Default: 0.002.
-        time_distance (int): Δ, how many steps movements precede those they cause. Default: 5.
-        s4avg (float): how many steps the sensor is smoothed over, 1 for none. Default: 2.
-        normalize (str): what the lengths of the rows of C divide: ``"rows"``, as in the paper, or
-            ``"columns"``, each that of the row with its index, as in the public code. Default:
+        kappa (float): κ, gain of the commands. Default: 1169.7.
+        tau (int): τ, number of steps summed in the matrix. Default: 40.
+        bias_rate (float): rate at which the bias counteracts a lasting command. Default: 0.002.
+        time_distance (int): Δ, steps from a movement to the one that it causes. Default: 5.
+        s4avg (float): number of steps that smooth the sensor, 1 for none. Default: 2.
+        normalize (str): ``"rows"`` divides each row of C by its norm, as in the paper;
+            ``"columns"`` divides column j by the norm of row j, as in the public code. Default:
             ``"rows"``.
-        device (torch.device, optional): where lengths will be.
-        dtype (torch.dtype, optional): of lengths.
+        device (torch.device, optional): device of the lengths.
+        dtype (torch.dtype, optional): dtype of the lengths.
 
     Raises:
         ValueError: if a setting is out of its range.
@@ -106,16 +105,16 @@ class DEPController:
         return len(self.bias)
 
     def reset(self, rows: Tensor) -> None:
-        """Some bodies begin a new episode: their way to its first lengths is no movement.
+        """Begin a new episode of some bodies; the jump to its first lengths is not a movement.
 
-        They are told by a mask [rows], or by their indices. What they have learned (the extremes of
-        the lengths, the latest movements and the bias) stays, as it does in the public code.
+        ``rows`` is a mask [rows] or indices. The adapted state (extremes of the lengths, latest
+        movements and bias) is kept, as in the public code.
         """
         self._jumped[rows] = True
 
     @torch.no_grad()
     def step(self, lengths: Tensor) -> Tensor:
-        """Take in the lengths [rows, n] of one time step, adapt, and command y [rows, n]."""
+        """Adapt to the lengths [rows, n] of one time step; returns the commands y [rows, n]."""
         self._sense(lengths)
         drive = torch.einsum("rij,rj->ri", self.weights(), self.sensed)
         drive = drive / (drive.norm(dim=-1, keepdim=True) + _TINY)
@@ -137,54 +136,54 @@ class DEPController:
         self._jumped = torch.zeros_like(self._jumped)
 
     def matrix(self) -> Tensor:
-        """C [rows, n, n], before it is normalised."""
+        """C [rows, n, n], before normalization."""
         causes = self.moves[:, self.time_distance :]
         return -torch.einsum("rki,rkj->rij", self.moves[:, : self.tau], causes)
 
     def weights(self) -> Tensor:
         """C̄ [rows, n, n]."""
         matrix = self.matrix()
-        # Rows of C and of C Mᵀ have the same length, as M = -I.
+        # Rows of C and of C Mᵀ have the same norm, as M = -I.
         length = matrix.norm(dim=-1, keepdim=True) + _TINY
         return self.kappa * matrix / (length if self.normalize == "rows" else length.mT)
 
 
 class DEPExploration(TensorDictModuleBase):
-    r"""Replaces a policy's actions by those of a :class:`DEPController`, now and then.
+    r"""Replaces some of a policy's actions by those of a :class:`DEPController`.
 
-    It goes behind the actor: ``TensorDictSequential(actor, DEPExploration(action_spec))``. At first
-    it acts alone; then, at each step that is the policy's, it draws whether the next few are its
-    own. It adapts all the while. Some episodes, of those that follow, are left to the policy.
+    Put it after the actor: ``TensorDictSequential(actor, DEPExploration(action_spec))``. DEP acts
+    alone for ``dep_frames`` frames. Later, each step of the policy may start a short burst of DEP's
+    actions, except in every ``policy_every``-th episode. DEP adapts at every step.
 
-    Its memory is its own and in neither the tensordict nor the ``state_dict()``: pushing weights to
-    a worker leaves it alone. Row i of a batch must be the same body at every call, as it is
-    in a collector; another number of rows starts anew in all but :attr:`frames`. Random numbers
-    come from torch's global generator. It acts and adapts where exploration is set to random, as in
-    collectors; elsewhere (under deterministic exploration, or outside of
-    :class:`torchrl.envs.set_exploration_type`) actions pass and it learns nothing of them.
+    Its state is in neither the tensordict nor the ``state_dict()``, so new weights leave a worker's
+    state alone. Row i of a batch must be the same body at every call, as in a collector; another
+    number of rows resets everything but :attr:`frames`. Random numbers come from torch's global
+    generator. It acts and adapts where exploration is set to random, as in collectors. Otherwise
+    (deterministic exploration, or outside :class:`torchrl.envs.set_exploration_type`) actions pass
+    unchanged and it does not adapt.
 
     Equation: see :class:`DEPController`.
 
-    Deviates: the paper explores for MPO and draws once for all its environments; here the learner
-    is free, and each row draws for itself. The controller also adapts in episodes that are the
-    policy's, where the public code leaves it out, and a burst ends with its episode.
+    Deviates: the paper explores for MPO and draws once for all its environments. Here any learner
+    can be used, and each row draws separately. The controller also adapts in the policy's episodes,
+    which the public code leaves out, and a burst ends with its episode.
 
     Args:
         action_spec (Bounded): the action's leaf, unbatched.
 
     Keyword Args:
-        dep_frames (int): frames that DEP acts alone, all rows and no other worker counted.
+        dep_frames (int): frames in which DEP acts alone, summed over the rows of this worker.
             Default: 200000.
-        probability (float): of a burst, at each step that is the policy's. Default: 4e-4.
+        probability (float): probability of a burst at each step of the policy. Default: 4e-4.
         intervention_length (int): steps of a burst. Default: 5.
-        policy_every (int): every which episode of a row is the policy's. Default: 3.
+        policy_every (int): every how many episodes of a row one is the policy's alone. Default: 3.
         action_key (NestedKey): Default: ``"action"``.
         length_key (NestedKey): Default: ``"muscle_length"``.
-        episode_key (NestedKey, optional): what tells that an episode begins: a boolean that is true
-            at its first step, as TorchRL's ``InitTracker`` writes, or an integer that differs
-            between episodes, such as ``("collector", "traj_ids")``, which collectors write.
-            Default: ``"is_init"``. Without the entry all is one episode.
-        **controller: see :class:`DEPController`; the defaults are those of the paper for legs.
+        episode_key (NestedKey, optional): marks where an episode begins: a boolean that is true at
+            its first step, as from TorchRL's ``InitTracker``, or an integer that differs between
+            episodes, such as a collector's ``("collector", "traj_ids")``. Default: ``"is_init"``.
+            Without the entry, all steps are one episode.
+        **controller: see :class:`DEPController`; the defaults are the paper's for legs.
 
     Keys:
         reads ``muscle_length`` [*, n], ``action`` [*, n] and, where present, ``is_init`` [*, 1] or
@@ -192,8 +191,8 @@ class DEPExploration(TensorDictModuleBase):
 
     Raises:
         TypeError: if the spec is not bounded, or for an unknown setting.
-        ValueError: if the spec is batched or a setting is out of its range; when called, if there
-            are more or fewer lengths than actuators.
+        ValueError: if the spec is batched or a setting is out of its range; when called, if the
+            numbers of lengths and actuators differ.
 
     Examples:
         >>> import torch
@@ -213,7 +212,7 @@ class DEPExploration(TensorDictModuleBase):
     """
 
     frames: int
-    """Frames seen so far. Set it to go on where another run ended."""
+    """Frames seen so far. Set it to resume a run."""
 
     def __init__(
         self,
@@ -255,7 +254,7 @@ class DEPExploration(TensorDictModuleBase):
         self._start(torch.empty(0, action_spec.shape[0]))
 
     def _start(self, lengths: Tensor) -> None:
-        # No buffers, which a collector would overwrite by the learner's when it updates weights.
+        # Not buffers: a collector's weight update would overwrite them with the learner's.
         rows, device = len(lengths), lengths.device
         self.controller = DEPController(
             *lengths.shape, **self._settings, device=device, dtype=lengths.dtype
@@ -266,8 +265,8 @@ class DEPExploration(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # Nor where none is set: a collector calls its policy once while it is built, and that is no
-        # step of a body.
+        # Also returns if none is set: a collector calls its policy once while it is built, which is
+        # not a step of a body.
         if exploration_type() is not ExplorationType.RANDOM:
             return tensordict
         lengths = self._lengths(tensordict)
@@ -316,7 +315,7 @@ class DEPExploration(TensorDictModuleBase):
         self.controller.reset(begins)
 
     def _is_dep(self) -> Tensor:
-        """Whether DEP acts [rows]; also draws, where it does not, whether it will from now on."""
+        """Whether DEP acts [rows]; where it does not, also draws whether a burst begins next."""
         bursting = self._burst_left > 0
         if self.frames < self.dep_frames:
             return torch.ones_like(bursting)

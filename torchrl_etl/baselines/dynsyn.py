@@ -20,18 +20,18 @@ from torchrl_etl.objectives.sac import drawn
 
 __all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
 
-# The deviations' network chooses within ±10 %, whatever the amplitude allows later on.
+# Weights of members stay within 10 % of 1, even before the amplitude limits them.
 _DEVIATION = 0.1
 
 
 class MuscleGroups(NamedTuple):
-    """Groups as indices.
+    """Muscle groups as index tensors.
 
     Attributes:
         group: number of each muscle's group [n].
         first: first member of each group [k].
-        slot: place of each muscle among those with a deviation [n], counted from 1; 0 for the
-            first members, which have none.
+        slot: position of each muscle among those with a deviation [n], from 1; 0 for the first
+            members, which have none.
     """
 
     group: Tensor
@@ -40,7 +40,7 @@ class MuscleGroups(NamedTuple):
 
     @classmethod
     def of(cls, groups: Tensor | Sequence[int]) -> MuscleGroups:
-        """From the number of each muscle's group.
+        """Build from the group number of each muscle.
 
         Examples:
             >>> MuscleGroups.of([0, 1, 0, 0]).slot
@@ -69,16 +69,15 @@ class MuscleGroups(NamedTuple):
 class GroupedTanhNormal(D.Distribution):
     """Tanh-Gaussian over k groups of n muscles; every member follows its group.
 
-    Where bounds are [-1, 1], a muscle's action is its group's, y, times a weight: 1 for the group's
-    first member, w = 1 + clip(0.1 tanh(v), ±amplitude), v ~ N(weight_loc, weight_scale²), for the
-    others, clamped to the bounds.
+    Where bounds are [-1, 1], a muscle's action is its group's action y times a weight, clamped to
+    the bounds. The weight is 1 for a group's first member. For the others it is
+    w = 1 + clip(0.1 tanh(v), ±amplitude), v ~ N(weight_loc, weight_scale²).
 
-    The log-probability is that of y alone, which the first members hold: the density of a
-    distribution on k dimensions, not on n.
+    The log-probability covers y alone, read from the first members: a density over k dimensions.
 
     Args:
-        loc, scale (Tensor): of the groups [*, k], before the tanh.
-        weight_loc (Tensor): mean of v [*, n - k], for members that are not first, in their order.
+        loc, scale (Tensor): mean and deviation of the groups [*, k] before the tanh.
+        weight_loc (Tensor): mean of v [*, n - k] for members that are not first, in muscle order.
         amplitude (Tensor): largest deviation of a weight from 1 [*, 1], in [0, 0.1].
         group, first, slot (Tensor): the groups [*, n], [*, k] and [*, n], see
             :class:`MuscleGroups`.
@@ -141,16 +140,16 @@ class GroupedTanhNormal(D.Distribution):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The action [*, n] where all Gaussians are at their means."""
+        """The action [*, n] with all Gaussians at their means."""
         return self._spread(self.group_normal.deterministic_sample, self.weight_loc)
 
     @property
     def _log_half(self) -> Tensor:
-        """How much wider than ±1 the bounds of the first members are [*]."""
+        """Log half width of the first members' bounds, summed over groups [*]."""
         return picked(self.half.log(), self.first).sum(-1)
 
     def _spread(self, shared: Tensor, weight: Tensor) -> Tensor:
-        """Actions [*, n] from the groups' in ±1 [*, k] and v [*, n - k]."""
+        """Actions [*, n] from the groups' actions in ±1 [*, k] and v [*, n - k]."""
         change = (_DEVIATION * weight.tanh()).clamp(-self.amplitude, self.amplitude)
         change = torch.cat([change.new_zeros(*change.shape[:-1], 1), change], -1)
         change = picked(change, self.slot)
@@ -159,7 +158,7 @@ class GroupedTanhNormal(D.Distribution):
 
 
 def picked(values: Tensor, index: Tensor) -> Tensor:
-    """The entries [*, k] of values [*, n] that an index [*, k] names; batch sizes may broadcast.
+    """Gather entries [*, k] of values [*, n] by an index [*, k]; batch sizes may broadcast.
 
     Examples:
         >>> picked(torch.tensor([[5, 6], [7, 8]]), torch.tensor([1, 1, 0]))
@@ -171,10 +170,10 @@ def picked(values: Tensor, index: Tensor) -> Tensor:
 
 
 class DynSynNetwork(nn.Module):
-    """What a DynSyn actor computes: the parameters of :class:`GroupedTanhNormal`.
+    """Network of a DynSyn actor: outputs the parameters of :class:`GroupedTanhNormal`.
 
-    The groups are among them: actors that are updated side by side have each its own. The layers
-    have k + n outputs.
+    They include the groups, which may differ between actors that are updated side by side. The
+    layers must have k + n outputs.
 
     Equation: amplitude(t) = clip(slope (t - start), 0, ceiling), with t in frames.
     """
@@ -193,14 +192,14 @@ class DynSynNetwork(nn.Module):
         self.normal = NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3)
         self.sizes = (2 * groups.num_groups, groups.num_muscles - groups.num_groups)
         self.slope, self.start, self.ceiling = slope, start, ceiling
-        # A buffer: the workers' amplitude then rises with the weights that they are sent.
+        # A buffer, so that weight updates also raise the workers' amplitude.
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         for name, index in groups._asdict().items():
             self.register_buffer(name, index, persistent=False)
 
     @property
     def amplitude(self) -> Tensor:
-        """Largest deviation of a weight from 1, at this time []."""
+        """Current largest deviation of a weight from 1 []."""
         return (self.slope * (self.frames - self.start)).clamp(0, self.ceiling)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -208,7 +207,7 @@ class DynSynNetwork(nn.Module):
         loc, scale = self.normal(shared)
         amplitude = self.amplitude.to(loc).unsqueeze(-1)
         fixed = (amplitude, self.group, self.first, self.slot)
-        # Copies: whoever clears what an actor wrote would clear its buffers.
+        # Copies: clearing an actor's outputs must not clear its buffers.
         shape = (*loc.shape[:-1], -1)
         return loc, scale, weight_loc, *(each.expand(shape).clone() for each in fixed)
 
@@ -226,20 +225,20 @@ def make_dynsyn_actor(
     start: int = 1_000_000,
     ceiling: float = 0.1,
 ) -> ProbabilisticActor:
-    """Actor that moves muscles in groups, and learns to tell their members apart later on.
+    """Actor that moves muscles in groups and later learns deviations of their members.
 
-    At first members of a group move as one. From ``start`` frames on, :func:`set_frames` lets their
-    weights deviate: by at most 10 % at 3,000,000 frames, with the defaults.
+    At first the members of a group get the same action. Once :func:`set_frames` passes ``start``,
+    their weights may deviate; with the defaults, by up to 10 % at 3,000,000 frames.
 
-    Its log-probability counts k dimensions, so SAC's target entropy should as well.
+    Its log-probability covers k dimensions, so SAC's target entropy should too.
 
-    Deviates: the last layer starts small, as in :func:`~torchrl_etl.modules.make_actor`, and its
-    mapping to scales is the one used there; the original is an ordinary SAC's.
+    Deviates: the last layer starts small and maps to scales as in
+    :func:`~torchrl_etl.modules.make_actor`; the original's is an ordinary SAC's.
 
     Args:
         inputs (mapping of NestedKey to int): keys that the actor reads, with their sizes.
         action_spec (TensorSpec): one unbatched bounded leaf, of n muscles.
-        groups (Tensor or sequence of int): number of each muscle's group [n], of
+        groups (Tensor or sequence of int): group number of each muscle [n], from
             :func:`~torchrl_etl.baselines.muscle_groups.group_muscles`.
 
     Keyword Args:
@@ -253,8 +252,8 @@ def make_dynsyn_actor(
         the bounds.
 
     Raises:
-        ValueError: if groups are not of n muscles or skip a number, or if slope is negative or
-            ceiling is outside [0, 0.1].
+        ValueError: if groups are not [n] or skip a number, slope is negative, or ceiling is outside
+            [0, 0.1].
 
     Examples:
         >>> import torch
@@ -285,7 +284,7 @@ def make_dynsyn_actor(
 
 
 def set_frames(actor: nn.Module, frames: int) -> None:
-    """Tell the DynSyn actors in a module how many frames were collected up to now.
+    """Set the number of frames collected so far in the DynSyn actors of a module.
 
     Raises:
         ValueError: if there is no such actor.

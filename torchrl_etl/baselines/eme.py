@@ -1,4 +1,4 @@
-"""EME (Wang 2024), what it learns: a metric that also compares policies."""
+"""EME's loss (Wang 2024): a state metric that also compares the policy between states."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ __all__ = ["EMELoss"]
 class EMELoss(LossModule):
     r"""Loss that trains EME's metric, as distances of state embeddings, and its reward ensemble.
 
-    Every transition is paired with one other of the batch. The distance of their embeddings is
-    pulled to their reward difference, plus ``gamma`` times how far apart their next states are,
-    plus how differently the policy acts in them. Both networks make up the bonus of
-    :class:`~torchrl_etl.baselines.eme_bonus.EMEBonus`.
+    Each transition is paired with one other of the batch. The distance of their embeddings
+    regresses to their reward difference, plus ``gamma`` times the distance of their next states,
+    plus the KL divergence of the policy between their states. Both networks are used for the bonus
+    in :class:`~torchrl_etl.baselines.eme_bonus.EMEBonus`.
 
     Equation: ``d(s_i, s_j) = |r_i - r_j| + gamma d(s'_i, s'_j) + KL(pi_i ‖ pi_j)``, regressed with
     the right side held fixed; each member of the ensemble regresses the reward.
@@ -43,49 +43,48 @@ class EMELoss(LossModule):
         - ``loss_reward_ensemble``: squared error of the predictions, mean over members;
         - ``mean_distance``, ``mean_reward_difference``, ``mean_policy_divergence`` (nats): over the
           pairs, detached;
-        - ``mean_reward_variance``: between the members, before EME's scale bounds it, detached;
+        - ``mean_reward_variance``: between the members, before EME clamps it, detached;
         - ``effective_rank``: of the embeddings, detached; near 1 means one used dimension.
 
     Deviates:
-        - The public code never trains the metric; this is the paper's, made for any learner with a
-          Gaussian policy below a tanh. Its learner is PPO in some tables and, to go by a weight
-          of soft updates and a learning rate of α in that of Robosuite, one like SAC there.
-        - d is the L2 distance of embeddings, hence symmetric and zero for a state with itself,
-          which a free network of both states would not be. KL is not symmetric: since a pair is
-          as likely drawn either way round, d settles between KL(pi_i ‖ pi_j) and
-          KL(pi_j ‖ pi_i).
-        - The next states' distance comes from a target encoder, and all terminated next states
-          are one absorbing state at the origin, as in
-          :class:`~torchrl_etl.objectives.BehavioralMetricLoss`: EME is compared with ETL, so what
-          is not EME's own idea is done as ETL does it.
+        - The public code never trains the metric; this is the paper's, for any learner with a
+          Gaussian policy below a tanh. The paper's learner is PPO in some tables. For Robosuite,
+          a soft-update weight and a learning rate of α suggest one like SAC.
+        - d is the L2 distance of embeddings. Unlike a free network of both states, it is symmetric
+          and zero between a state and itself. KL is not symmetric: since both orders of a pair are
+          equally likely, d settles between KL(pi_i ‖ pi_j) and KL(pi_j ‖ pi_i).
+        - The next states' distance uses a target encoder, and all terminated next states are one
+          absorbing state at the origin, as in
+          :class:`~torchrl_etl.objectives.BehavioralMetricLoss`. EME is compared with ETL, so
+          whatever is not EME's own follows ETL.
         - The error is smooth-L1, since the divergence of nearly deterministic policies runs to
           hundreds of nats; ``loss_function="l2"`` is the squared error.
-        - ``policy_weight=gamma`` and ``reward_difference="corrected"``, which takes the members'
-          variances of both rewards off the squared difference, are how other rebuilders of EME
-          read its regression target.
+        - Other reimplementations of EME read its target as ``policy_weight=gamma`` and
+          ``reward_difference="corrected"``. The latter subtracts the ensemble's variances of both
+          rewards from the squared difference.
 
     Args:
         encoder (TensorDictModule): φ; its first out key is the embedding [*, k].
         ensemble (TensorDictModule): the reward predictors, such as
             :class:`~torchrl_etl.baselines.reward_ensemble.RewardEnsemble`; its first out key holds
             one prediction for each member [*, K].
-        actor (ProbabilisticTensorDictSequential): the policy that is being learned. It is held by
-            reference: it gets no gradient, and neither ``parameters()`` nor ``state_dict()`` of
-            the loss contain it.
+        actor (ProbabilisticTensorDictSequential): the policy that is being learned, held by
+            reference. It gets no gradient and is not in the loss's ``parameters()`` or
+            ``state_dict()``.
 
     Keyword Args:
-        gamma (float): discount factor in [0, 1); that of the learner, since the metric is one of
-            its returns. Default: ``0.95``.
-        policy_weight (float): weight of the policies' divergence. Default: ``1.0``.
+        gamma (float): discount factor in [0, 1); use the learner's, since the metric is a
+            discounted return. Default: ``0.95``.
+        policy_weight (float): weight of the policy's divergence. Default: ``1.0``.
         reward_difference (str): ``"sampled"`` or ``"corrected"``. Default: ``"sampled"``.
         loss_function (str): ``"smooth_l1"`` or ``"l2"``, of the distances.
             Default: ``"smooth_l1"``.
-        subset_share (float): in (0, 1]; each member learns on its own random subset of every batch,
-            of this expected share. Members differ by initialisation anyway. Default: ``0.8``.
-        policy_keys (pair of NestedKey): where the actor writes mean and standard deviation of the
-            Gaussian. Default: ``("loc", "scale")``.
-        delay_encoder (bool): keep a separate target encoder, for ``SoftUpdate`` to move. Without
-            it the target is the present encoder, detached. Default: ``True``.
+        subset_share (float): in (0, 1]; expected share of each batch that a member learns from, its
+            own random subset. Members also differ by initialization. Default: ``0.8``.
+        policy_keys (pair of NestedKey): the actor's keys of the Gaussian's mean and standard
+            deviation. Default: ``("loc", "scale")``.
+        delay_encoder (bool): keep a target encoder, which ``SoftUpdate`` updates. Otherwise targets
+            use the current encoder, detached. Default: ``True``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default: ``"mean"``.
 
     Raises:
@@ -116,7 +115,7 @@ class EMELoss(LossModule):
         >>> updater.step()
     """
 
-    _AcceptedKeys = BehavioralMetricLoss._AcceptedKeys  # the two metrics read the same
+    _AcceptedKeys = BehavioralMetricLoss._AcceptedKeys  # both metrics read the same keys
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
 
@@ -162,7 +161,7 @@ class EMELoss(LossModule):
         self.gamma, self.policy_weight, self.subset_share = gamma, policy_weight, subset_share
         self.reward_difference, self.loss_function = reward_difference, loss_function
         self.reduction, self.policy_keys = reduction, policy_keys
-        # In a tuple the actor is no part of the loss: whoever trains, saves, casts or resets the
+        # In a tuple, so that the actor is no submodule: training, saving, casting or resetting the
         # loss leaves it alone.
         self._actor = (actor,)
         self.convert_to_functional(encoder, "encoder", create_target_params=delay_encoder)
@@ -187,13 +186,13 @@ class EMELoss(LossModule):
         keys = self.tensor_keys
         following = (*self.encoder.in_keys, keys.reward, keys.terminated)
         parts = (self.encoder, self.actor, self.ensemble)
-        # Several parts read the observation: a dictionary keeps each key once, and the order.
+        # Several parts read the observation: a dictionary keeps each key once, in order.
         present = dict.fromkeys(key for part in parts for key in part.in_keys)
         self.in_keys = [*present, *(unravel_key(("next", key)) for key in following)]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The entries named under ``Keys``, of a batch of any size that is left unchanged."""
+        """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
         reward = tensordict["next"].get(self.tensor_keys.reward)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten()
@@ -237,7 +236,7 @@ class EMELoss(LossModule):
         )
 
     def _difference(self, reward: Tensor, variance: Tensor, partner: Tensor) -> Tensor:
-        """How far the rewards of each pair lie apart [samples]."""
+        """Reward difference of each pair [samples]."""
         difference = (reward - reward[partner]).abs()
         if self.reward_difference == "corrected":
             noise = variance + variance[partner]
@@ -247,11 +246,11 @@ class EMELoss(LossModule):
     def _gaussian(self, tensordict: TensorDictBase, like: Tensor) -> list[Tensor]:
         """Mean and standard deviation [samples, n] of the actor below its tanh.
 
-        The divergence of two Gaussians is that of their images under one invertible map, so the
-        tanh and the bounds of the action do not matter.
+        An invertible map of both Gaussians does not change their divergence, so the tanh and the
+        bounds of the action do not matter.
         """
-        # The loss may have been cast without the actor. Entry by entry: torch.compile (2.13) cannot
-        # trace TensorDict.to.
+        # The loss may have been cast without the actor. Cast entry by entry: torch.compile (2.13)
+        # cannot trace TensorDict.to.
         parameter = next(self.actor.parameters(), like)
         entries = {key: tensordict.get(key).to(parameter) for key in self.actor.in_keys}
         inputs = TensorDict(entries, tensordict.batch_size)

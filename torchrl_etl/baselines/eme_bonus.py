@@ -1,4 +1,4 @@
-"""EME (Wang 2024), what it adds to the reward: how far a step moved in the learned metric."""
+"""EME's bonus (Wang 2024): how far a step moved in the learned metric."""
 
 from __future__ import annotations
 
@@ -21,39 +21,38 @@ __all__ = ["EMEBonus"]
 
 
 class EMEBonus(TransitionReward):
-    """Rewards steps that are long in EME's metric, more so where the reward is not yet known.
+    """Rewards steps that are long in EME's metric, more so where reward predictions disagree.
 
-    As :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, on a replay buffer or in
-    a learner, where every *sampled* batch gets the bonus of the networks as they are by then, and
-    on a tensordict, and holds both networks by reference: they belong to whoever trains them
-    (:class:`~torchrl_etl.baselines.eme.EMELoss`).
+    Like :class:`~torchrl_etl.transforms.IntrinsicReward` it works on an env, a tensordict, a replay
+    buffer or in a learner; the last two give every *sampled* batch the current networks' bonus.
+    Both networks are held by reference; :class:`~torchrl_etl.baselines.eme.EMELoss` trains them.
 
     Equation: ``b = d(s, s') min(max(Var_k r̂_k(s, a), 1), M)``, and ``r + weight b`` for the
     learner; with ``normalize``, ``r + weight σ_r b / σ_b`` with running standard deviations.
 
-    Deviates: the public code adds up four terms (cosine distance, KL, error of the reward, capped
-    variance) where the paper has this product; ``normalize`` is in neither.
+    Deviates: the public code adds four terms (cosine distance, KL, error of the reward, capped
+    variance) where the paper has this product. ``normalize`` is in neither.
 
     Args:
         encoder (TensorDictModuleBase): φ, with one in-key and one out-key; d is the L2 distance of
-            its embeddings. Its own key names need not be those of the data.
+            its embeddings. Its key names may differ from the data's.
         ensemble (TensorDictModuleBase): reward predictors, with two in-keys (observation and
-            action, in this order) and one out-key, one prediction for each member [*, K]. Likewise.
+            action, in this order) and one out-key, with one prediction per member [*, K]. Likewise.
 
     Keyword Args:
-        weight (float): of the bonus in the total reward. Default: 1.
+        weight (float): weight of the bonus in the total reward. Default: 1.
         max_scale (float): M, at least 1. Default: 10.
-        normalize (bool): the weight counts deviations: what the bonus adds deviates ``weight``
-            times as much as the task's reward. The metric grows without bound as the policy
-            becomes certain, since KL does, and an unscaled bonus with it. The scale is 1 while all
-            rewards were zero. Default: ``False``.
-        decay (float): in (0, 1); a call weighs ``1 - decay`` in the running statistics, which are
-            in the ``state_dict()``. Default: 0.99.
+        normalize (bool): scale the bonus to ``weight`` times the deviation of the task's reward.
+            Unscaled, it grows without bound as the policy becomes certain, since KL and with it
+            the metric do. As long as all rewards were zero, their deviation counts as 1.
+            Default: ``False``.
+        decay (float): in (0, 1); a call has weight ``1 - decay`` in the running statistics, which
+            are in the ``state_dict()``. Default: 0.99.
         in_keys (sequence of NestedKey): keys of observation and action. Default:
             ``("observation", "action")``.
         out_keys (sequence of NestedKey): keys of bonus and total reward, both below ``"next"``.
             Default: ``("intrinsic_reward", "total_reward")``.
-        reward_key (NestedKey): the task's reward, left as it is. Default: ``"reward"``.
+        reward_key (NestedKey): the task's reward, not modified. Default: ``"reward"``.
 
     Keys:
         reads ``observation`` [*, O], ``action`` [*, n], ``("next", "observation")`` and
@@ -84,7 +83,7 @@ class EMEBonus(TransitionReward):
 
     encoder: TensorDictModuleBase
     ensemble: TensorDictModuleBase
-    """Those given at construction, not copies."""
+    """The networks given at construction, not copies."""
 
     _cure = "name the right one in in_keys."
 
@@ -112,8 +111,8 @@ class EMEBonus(TransitionReward):
         check_real("[1, inf)", max_scale=max_scale)
         check_real("[0, inf)", weight=weight)
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
-        # No submodules: as such they would follow the env's device, be put in eval mode under the
-        # learner's feet, and be saved twice.
+        # Not submodules: they would follow the env's device, be put in eval mode while the learner
+        # uses them, and be saved twice.
         self.__dict__ |= {"encoder": encoder, "ensemble": ensemble}
         self.weight, self.max_scale = weight, max_scale
         self.deviation = RunningDeviation(decay) if normalize else None
@@ -146,7 +145,7 @@ class EMEBonus(TransitionReward):
         return bonus, reward + self.weight * self._in_units_of(reward, bonus)
 
     def _in_units_of(self, reward: Tensor, bonus: Tensor) -> Tensor:
-        """The bonus, where normalized with the deviation of the rewards."""
+        """The bonus; if normalized, with the deviation of the rewards."""
         if self.deviation is None or self.reward_deviation is None:
             return bonus
         self.deviation.update(bonus)

@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 
-# Of log σ and of log S, as the public code has them.
+# Bounds of log σ and of log S in the public code.
 _PLAIN_BOUNDS = (-20.0, 2.0)
 _STATE_DEPENDENT_BOUNDS = (math.log(1e-3), math.log(10.0))
 
@@ -70,14 +70,14 @@ class LatticeNormal(D.TransformedDistribution):
                 "must be below its upper bound. Take them from the environment's action spec."
             )
         gaussian = D.MultivariateNormal(loc, scale_tril=scale_tril, validate_args=False)
-        # TorchRL's tanh stays off ±1 by as much as keeps its inverse finite.
+        # TorchRL's tanh stays inside ±1, so its inverse is finite.
         squash = [SafeTanhTransform(), D.AffineTransform((high + low) / 2, (high - low) / 2)]
         super().__init__(gaussian, squash, validate_args=False)
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
         """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too.
 
-        No system is solved: where a sample is loc + L ε, its distance from the mean is ‖ε‖².
+        No linear system is solved: a sample loc + L ε has Mahalanobis distance ‖ε‖ from the mean.
         """
         gaussian = self.base_dist
         loc, scale_tril = gaussian.loc, gaussian.scale_tril
@@ -103,8 +103,8 @@ def lattice_scale_tril(weight: Tensor, latent_variance: Tensor, action_variance:
     """Cholesky factor of W diag(v_x) Wᵀ + diag(v_a).
 
     Deviates: the diagonal is enlarged by 10 n machine epsilons (0.005 % at n = 39 in single
-    precision). By as much an error of rounding can make a covariance indefinite whose correlations
-    are near one, as they are where a wide W drives many actuators with few features.
+    precision). Rounding errors of that size can make a covariance indefinite if correlations are
+    near one, as they are where a wide W drives many actuators with few features.
 
     Args:
         weight (Tensor): W [n, H].
@@ -123,8 +123,8 @@ def lattice_scale_tril(weight: Tensor, latent_variance: Tensor, action_variance:
                 [4.0000, 9.0000]])
     """
     n = weight.shape[0]
-    # One product of matrices: the covariance is linear in v_x, its coefficients are products of
-    # weights. A product for each sample would write [*, n, H] to memory first.
+    # One matrix product: the covariance is linear in v_x, with products of weights as coefficients.
+    # A product for each sample would write [*, n, H] to memory first.
     products = (weight.unsqueeze(1) * weight.unsqueeze(0)).flatten(0, 1)
     covariance = nn.functional.linear(latent_variance, products).unflatten(-1, (n, n))
     variance = covariance.diagonal(dim1=-2, dim2=-1) + action_variance
@@ -141,7 +141,7 @@ class _Spread(nn.Module):
         super().__init__()
         self.bounds, self.sizes = bounds, (features, action_dim)
         self.head = nn.Linear(features, features + action_dim)
-        # Every state starts with the same spread, so that differences between them were learned.
+        # Every state starts with nearly the same spread, so that differences are learned.
         with torch.no_grad():
             self.head.weight.mul_(0.01)
             self.head.bias.fill_(init)
@@ -201,7 +201,7 @@ class StateDependentSpread(nn.Module):
 
 
 class LatticeNetwork(nn.Module):
-    """What a Lattice actor computes: mean and Cholesky factor [*, n, n] of its covariance.
+    """Network of a Lattice actor: outputs the mean and the covariance's Cholesky factor [*, n, n].
 
     Args:
         layers (nn.Sequential): ends with the linear layer W, b.
@@ -232,19 +232,19 @@ def make_lattice_actor(
     alpha: float = 1.0,
     std_reg: float = 1e-3,
 ) -> ProbabilisticActor:
-    """Actor whose noise on the last hidden features moves actuators together.
+    """Actor with noise on its last hidden features, which correlates the actuators.
 
-    With features x [H], last layer W [n, H], b [n]: actuators that W drives alike get correlated
-    noise. Everything is differentiated, W in the covariance and x in its variances included.
+    The last layer maps features x [H] to actions by W [n, H] and b [n]. Actuators with similar rows
+    of W get correlated noise. W in the covariance and x in its variances get gradients too.
 
     Equation: a ~ tanh N(Wx + b, Σ), Σ = W diag(σ_x²) Wᵀ + diag(σ_a²) with log (σ_x, σ_a) linear in
     x; with ``state_dependent`` Σ = α² W diag(x² S_x²) Wᵀ + diag(x² S_a² + std_reg²), the
     distribution of what :class:`~torchrl_etl.baselines.lattice_noise.LatticeNoise` does.
 
-    Deviates: at a bound of log σ the gradient still passes inwards (theirs stops there for good);
-    means are not clipped to ±2; std_reg is 0.001, not 0, since features can all be zero; W starts
-    as PyTorch draws it, not small as in :func:`~torchrl_etl.modules.make_actor`, since it is also
-    the shape of the noise. See :func:`lattice_scale_tril` for the diagonal.
+    Deviates: at a bound of log σ, gradients that lead back inside still pass (the original's stop
+    there for good). Means are not clipped to ±2. std_reg is 0.001, not 0, since features can all be
+    zero. W keeps PyTorch's initialization, unlike :func:`~torchrl_etl.modules.make_actor`, since it
+    also shapes the noise. See :func:`lattice_scale_tril` for the diagonal.
 
     Args:
         inputs (mapping of NestedKey to int): keys that the actor reads, with their sizes.
@@ -254,19 +254,19 @@ def make_lattice_actor(
         out_key (NestedKey): where the sample goes. Default: ``"action"``.
         body, hidden, layer_norm: as in :func:`~torchrl_etl.modules.make_actor`.
         state_dependent (bool): the second Σ. Default: ``False``.
-        log_std_init (float): log σ (or log S) at the start. Default: 0.
-        log_std_bounds (pair of float, optional): its least and greatest value. Default: those of
-            the public code, [-20, 2] for log σ and those of (1e-3, 10) for log S (for Humanoid and
-            Ant it takes (1e-3, 1)).
-        alpha, std_reg (float): α ≥ 0 and std_reg ≥ 0, of the second Σ.
+        log_std_init (float): initial log σ (or log S). Default: 0.
+        log_std_bounds (pair of float, optional): its bounds. Default: the public code's, [-20, 2]
+            for log σ, and the logarithms of (1e-3, 10) for log S (of (1e-3, 1) in its Humanoid and
+            Ant).
+        alpha, std_reg (float): α ≥ 0 and std_reg ≥ 0, for the second Σ.
 
     Keys:
         reads ``inputs``; writes ``loc`` [*, n], ``scale_tril`` [*, n, n] (before the tanh) and
         ``out_key`` [*, n] within the bounds.
 
     Raises:
-        ValueError: without a hidden layer, if bounds are no pair in order or do not hold the start,
-            or if alpha or std_reg is negative.
+        ValueError: if there is no hidden layer, the bounds are not an ordered pair that contains
+            ``log_std_init``, or alpha or std_reg is negative.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Lattice's state-dependent exploration: noise matrices that are kept for several steps."""
+"""Lattice's state-dependent exploration, with noise matrices held for several steps."""
 
 from __future__ import annotations
 
@@ -18,35 +18,34 @@ __all__ = ["LatticeNoise"]
 
 
 class LatticeNoise(TensorDictModuleBase):
-    """A Lattice actor whose noise is a function of the state, drawn anew every few steps.
+    """Lattice actor whose noise is a function of the state, redrawn every few steps.
 
     Between two draws the policy is deterministic, so similar states get similar noise. Over draws
-    the action in a state has the actor's own distribution (less ``std_reg``), so off-policy
-    learners train the actor and need not know of this module.
+    the action in a state has the actor's own distribution (without ``std_reg``), so off-policy
+    learners train the actor and need no change.
 
-    The matrices are this module's own, by row of the batch: it must be called with the same
-    simulators in the same order, as a collector does. They are no part of the state dict or of a
-    copy, which draws its own. Under any other exploration type than random the squashed mean is
-    written.
+    The matrices are kept per row of the batch. Every call must have the same simulators in the same
+    order, as in a collector. Matrices are not in the state dict, and a copy draws its own. Under an
+    exploration type other than random it writes the squashed mean.
 
     Equation: a = W(x + α P_x x) + b + P_a x, with P_x ~ N(0, S_x²) [H, H], P_a ~ N(0, S_a²) [H, n];
     the action is tanh(a), scaled to the bounds.
 
     Args:
-        actor (ProbabilisticTensorDictSequential): of
+        actor (ProbabilisticTensorDictSequential): from
             :func:`~torchrl_etl.baselines.lattice.make_lattice_actor` with ``state_dependent=True``.
 
     Keyword Args:
-        freq (int): steps after which matrices are drawn anew. Default: 8.
+        freq (int): steps between draws of the matrices. Default: 8.
         init_key (NestedKey): see :class:`torchrl.envs.InitTracker`. Default: ``"is_init"``.
 
     Keys:
-        reads the actor's and, if there, ``is_init`` [*, 1], bool: rows whose matrices are drawn
-        anew; writes the actor's sample [*, n], and neither mean nor covariance, which acting does
+        reads the actor's in-keys and, if present, ``is_init`` [*, 1], bool: rows whose matrices are
+        redrawn; writes the actor's sample [*, n], but not mean and covariance, which acting does
         not need.
 
     Raises:
-        TypeError: if the actor is not such a one.
+        TypeError: if the actor is not a state-dependent Lattice actor.
         ValueError: if freq is not positive.
 
     Examples:
@@ -103,7 +102,7 @@ class LatticeNoise(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self._squashed(value))
 
     def _squashed(self, value: Tensor) -> Tensor:
-        # The distribution holds the way to the bounds; its covariance plays no part in it.
+        # Uses the distribution's map to the bounds; its covariance has no effect.
         distribution = self.actor[-1].distribution_class(
             value, torch.eye(value.shape[-1]).to(value), **self.actor[-1].distribution_kwargs
         )
@@ -120,7 +119,7 @@ class LatticeNoise(TensorDictModuleBase):
         fresh = self._age >= self.freq
         if begins is not None:
             fresh = fresh | begins.squeeze(-1)
-        # Only what is used is drawn: matrices for all rows at every step would cost more than a
+        # Draws only what is used: matrices for all rows at every step would cost more than a
         # small simulator's step.
         count = int(fresh.sum())
         if count:
@@ -131,12 +130,12 @@ class LatticeNoise(TensorDictModuleBase):
         return self._matrices
 
     def __getstate__(self) -> dict[str, Any]:
-        # Workers that began with equal matrices would explore alike until the next draw.
+        # Workers that start with equal matrices would explore alike until the next draw.
         return super().__getstate__() | {"_matrices": None, "_age": None}
 
 
 def _times(features: Tensor, matrices: Tensor) -> Tensor:
-    """A row vector for each row, times its matrix."""
+    """Product of each row's vector with its matrix."""
     return (features.unsqueeze(-2) @ matrices).squeeze(-2)
 
 

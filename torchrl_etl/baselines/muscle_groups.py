@@ -1,4 +1,4 @@
-"""Which muscles belong together, found from how their lengths vary (He 2024, DynSyn)."""
+"""Muscle groups, from how muscle lengths vary together (DynSyn, He 2024)."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def record_muscle_lengths(
     seed: int = 0,
     on_step: Callable[[], None] = lambda: None,
 ) -> Tensor:
-    """Lengths of a body's actuators while its joints are thrown about.
+    """Record actuator lengths while a body's joints move at random velocities.
 
     Every few steps the velocity of each joint is drawn from U(-1, 1)·amplitude; the action is zero
-    throughout. Objects, on whatever joints they hang, and a root that floats freely stay where the
-    episode began, and nothing touches an object: what these do says nothing about muscles.
+    throughout. Objects, whatever their joints, and a free root begin every step where the episode
+    began, and nothing collides with objects: their motion says nothing about muscles.
 
-    Deviates: the original lets legs rise at 0.1 m/s and sets objects a metre off, and goes on
-    where an episode ends, for 500 frames; here episodes end where the environment ends them, so
-    objects stay. The original records 500,000 frames.
+    Deviates: the original raises legs at 0.1 m/s, moves objects a metre away, and goes on where an
+    episode ends, for 500 frames. Here the environment ends episodes, so objects stay in place. The
+    original records 500,000 frames.
 
     Args:
-        env (EnvBase): of :func:`~torchrl_etl.envs.make_env`, on MuJoCo, with one simulator. It is
+        env (EnvBase): from :func:`~torchrl_etl.envs.make_env`, on MuJoCo, with one simulator. It is
             seeded and reset.
         frames (int): number of steps.
 
     Keyword Args:
-        amplitude (float): largest velocity, in rad/s. The original takes 10 for legs and 100 for
+        amplitude (float): largest velocity, in rad/s. The original uses 10 for legs and 100 for
             hands.
         every (int): steps between draws. Default: 10.
-        seed (int): of the environment and the velocities. Default: 0.
+        seed (int): seed of the environment and the velocities. Default: 0.
         on_step (callable): called before every step; may raise to stop.
 
     Returns:
@@ -96,31 +96,31 @@ def record_muscle_lengths(
 def group_muscles(
     lengths: Tensor, num_groups: int, *, chunk: int = 100, restarts: int = 20, seed: int = 0
 ) -> Tensor:
-    """Groups of muscles whose lengths vary alike.
+    """Group muscles whose lengths vary alike.
 
-    Each muscle's length is scaled to [0, 1] over the recording. In each chunk of it two muscles are
-    compared by the cosine of their lengths, not centred; one minus its mean over chunks, at least
-    zero, is their distance, and k-medoids on these distances gives the groups.
+    Each muscle's length is scaled to [0, 1] over the recording, which is split into chunks. The
+    distance of two muscles is one minus the cosine of their uncentered lengths, averaged over
+    chunks, at least zero. k-medoids on these distances gives the groups.
 
-    Deviates: of the restarts the one with the least loss is taken; the original takes the loss that
-    most of them reach. Frames after the last full chunk are left out.
+    Deviates: the restart with the lowest loss is used; the original uses the loss that most
+    restarts reach. Frames after the last full chunk are left out.
 
     Args:
-        lengths (Tensor): [frames, n], of :func:`record_muscle_lengths`.
-        num_groups (int): k ≤ n. The original takes 40 for 80 leg muscles, 25 for 39 of a hand.
+        lengths (Tensor): [frames, n], from :func:`record_muscle_lengths`.
+        num_groups (int): k ≤ n. The original uses 40 for 80 leg muscles, 25 for 39 of a hand.
 
     Keyword Args:
         chunk (int): frames in a chunk. Default: 100.
-        restarts (int): of k-medoids, from medoids drawn at random. Default: 20.
-        seed (int): of the first restart; the others count on. Default: 0.
+        restarts (int): runs of k-medoids, each from random medoids. Default: 20.
+        seed (int): seed of the first restart, increased by one for each further one. Default: 0.
 
     Returns:
         Tensor: group number of each muscle [n], int64; groups are numbered from 0 in the order of
         their first members.
 
     Raises:
-        ValueError: for lengths of another form, fewer frames than a chunk, more groups than
-            muscles, or a muscle whose length never changes.
+        ValueError: if lengths has another shape, fewer frames than a chunk, fewer muscles than
+            groups, or a muscle whose length never changes.
 
     Examples:
         >>> import torch
@@ -163,16 +163,16 @@ def _numbered(labels: np.ndarray) -> Tensor:
 
 
 class _Held(HeldJoints):
-    """Objects and a free root, which begin every step where the episode began.
+    """Puts objects and a free root back to where the episode began, before every step.
 
-    In the step nothing collides with an object, which a finger would only hit again and again. The
-    model is itself between steps: a reset may build on which geoms collide.
+    During a step nothing collides with objects, which fingers would hit again and again. Collision
+    masks are restored after each step, since a reset may depend on them.
     """
 
     def __init__(self, model: mujoco.MjModel, state: mujoco.MjData) -> None:
         own = body_joints(model, state)
         super().__init__(model, state, ~own | root_joints(model, state))
-        # Every geom that hangs on an object's joint, by its kinematic tree.
+        # Every geom of an object, by its kinematic tree.
         objects = np.unique(model.dof_treeid[model.jnt_dofadr[~own]])
         self._geoms = np.isin(model.body_treeid[model.geom_bodyid], objects)
         self._collide = (model.geom_contype, model.geom_conaffinity)

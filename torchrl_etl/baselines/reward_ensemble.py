@@ -1,4 +1,4 @@
-"""Reward predictors that disagree where a reward is not yet known, and by how much they do."""
+"""An ensemble of reward predictors and EME's measure of their disagreement."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["RewardEnsemble", "diversity_scale"]
 
 
 def diversity_scale(predictions: Tensor, maximum: float = 10.0) -> Tensor:
-    r"""EME's factor ``[*, 1]``: how much predictions ``[*, K]`` of a reward differ, in ``[1, M]``.
+    r"""EME's factor ``[*, 1]``: variance of reward predictions ``[*, K]``, clamped to ``[1, M]``.
 
     .. math:: \min(\max(\mathrm{Var}_k\, \hat r_k(s, a),\, 1),\, M)
 
-    Deviates: which variance is not said; this is the population's (divided by K).
+    Deviates: the paper does not say which variance; this is the population's (divided by K).
 
     Examples:
         >>> import torch
@@ -38,12 +38,12 @@ class _Members(nn.ModuleList):
 
 
 class RewardEnsemble(TensorDictModule):
-    """Reward predictors r̂_k(s, a), each with an initialisation of its own.
+    """Reward predictors r̂_k(s, a), each with its own initialization.
 
     Args:
         observation_dim (int): size O of the observation.
         action_dim (int): number n of actuators.
-        size (int): members K. With one the variance is zero and EME's scale always 1.
+        size (int): number K of members. With one, the variance is zero and EME's scale always 1.
             Default: ``6``.
 
     Keyword Args:

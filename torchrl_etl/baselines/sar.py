@@ -19,7 +19,7 @@ __all__ = ["SARDecoder", "best_episodes"]
 
 
 class _BlendedBasis(nn.Module):
-    """z ∈ [-1, 1]^d → mean + z·basis, blended with a raw action, in the bounds."""
+    """z ∈ [-1, 1]^d → mean + z·basis, blended with a raw action and clamped to the bounds."""
 
     def __init__(
         self, mean: Tensor, basis: Tensor, low: Tensor, high: Tensor, blend: float
@@ -39,29 +39,29 @@ class _BlendedBasis(nn.Module):
 
 
 class SARDecoder(SynergyMap):
-    """Decodes synergy coefficients into muscle actions by an affine map that does not learn.
+    """Decodes synergy coefficients into muscle actions by a fixed affine map.
 
-    It stands wherever a :class:`~torchrl_etl.modules.SynergyDecoder` does, but has no parameters:
-    everything in it is a buffer. Make one with :meth:`fit`.
+    It can replace a :class:`~torchrl_etl.modules.SynergyDecoder`, but has only buffers and no
+    parameters. Make one with :meth:`fit`.
 
-    With a ``blend`` φ below 1 the synergy key has d + n entries, of which the last n are a raw
-    action in [-1, 1]^n.
+    With a ``blend`` φ below 1 the synergy key has d + n entries. The last n are a raw action in
+    [-1, 1]^n.
 
-    Equation: a = φ·inverse(z) + (1 - φ)·a_raw, brought into the bounds, where inverse leads back
-    through the scaling, the independent and the principal components.
+    Equation: a = φ·inverse(z) + (1 - φ)·a_raw, clamped to the bounds, where inverse undoes the
+    scaling, the independent and the principal components.
 
     Deviates: the paper's critics value the coefficients and the raw action; under
     :class:`~torchrl_etl.objectives.SynergySACLoss` they value the executed action. See also
     :meth:`fit`.
 
     Args:
-        mean (Tensor): the action of z = 0 [n].
-        basis (Tensor): what a unit of each coefficient adds to it [d, n].
+        mean (Tensor): the action at z = 0 [n].
+        basis (Tensor): change of the action per unit of each coefficient [d, n].
 
     Keyword Args:
         low, high (float, sequence of float or Tensor): action bounds, one or [n].
             Default: -1 and 1.
-        blend (float): φ in (0, 1]; the paper's are 0.66 for hands and 1 (synergies only) for legs.
+        blend (float): φ in (0, 1]; the paper uses 0.66 for hands and 1 (synergies only) for legs.
             Default: 0.66.
         in_keys (sequence of NestedKey): the coefficients. Default: ``("synergy",)``.
         out_keys (sequence of NestedKey): the action. Default: ``("action",)``.
@@ -124,30 +124,30 @@ class SARDecoder(SynergyMap):
     ) -> SARDecoder:
         """Find the synergies of recorded muscle activity.
 
-        Principal components, then independent ones, then a scaling of each coefficient to [-1, 1];
-        all three are affine, and become one map here.
+        Principal components, then independent ones, then a scaling of each coefficient to [-1, 1].
+        All three are affine and are combined into one map.
 
-        Deviates: the public code is fitted on activations in [0, 1] but emits actions, which pass
-        MyoSuite's sigmoid once more on their way to the muscles. Here ``actions`` are activations
-        mapped back through it to action units, a = 1/2 + ln(x / (1 - x)) / 5, as the entry
-        ``activation`` of ``make_env(..., activations=True)`` is already.
+        Deviates: the public code is fitted on activations in [0, 1] but outputs actions, which pass
+        MyoSuite's sigmoid once more. Here ``actions`` are activations mapped back through the
+        sigmoid to action units, a = 1/2 + ln(x / (1 - x)) / 5. The entry ``activation`` of
+        ``make_env(..., activations=True)`` already is in these units.
 
         Args:
-            actions (Tensor): muscle activity [N, n] in action units, such as that of
+            actions (Tensor): muscle activity [N, n] in action units, such as from
                 :func:`best_episodes`.
             num_synergies (int): number d of synergies. Default: 20.
 
         Keyword Args:
             low, high, blend: see the class.
-            seed (int): of the search for independent components. Default: 0.
+            seed (int): seed of the search for independent components. Default: 0.
             in_keys, out_keys: see the class.
 
         Returns:
             SARDecoder: in the dtype and on the device of the actions.
 
         Raises:
-            ValueError: if there are too few actions or dimensions in which they vary, or they do
-                not fit (see :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
+            ValueError: if there are too few actions or dimensions in which they vary, or they are
+                invalid (see :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
         """
         _check_blend(blend)
         check_integer(1, num_synergies=num_synergies)
@@ -160,10 +160,10 @@ class SARDecoder(SynergyMap):
         return cls(mean.to(actions), basis.to(actions), low=low, high=high, blend=blend, **keys)
 
     def log_slope(self, synergy: Tensor) -> Tensor:
-        """Zero [*]: inside of the bounds the raw action moves an action as far as in the middle.
+        """Zero [*]: inside the bounds the raw action moves the action equally far everywhere.
 
-        An action that is clamped does not move at all; its noise counts as entropy all the same, as
-        it does in the public code.
+        A clamped action does not move at all, but its noise still counts as entropy, as in the
+        public code.
         """
         return synergy.new_zeros(synergy.shape[:-1])
 
@@ -192,28 +192,28 @@ def best_episodes(
     percentile: float = 80.0,
     preview: Tensor | None = None,
 ) -> Tensor:
-    """The actions of those episodes whose return is above a percentile of all returns.
+    """Actions of the episodes whose return is above a percentile of all returns.
 
-    Where no episode lies above it, those with the highest return are taken.
+    If there is none, the episodes with the highest return are used.
 
     Args:
         actions (Tensor): one row for each step of each episode [N, n].
-        returns (Tensor): the return of the episode that the row belongs to [N].
+        returns (Tensor): return of each row's episode [N].
 
     Keyword Args:
-        episodes (Tensor, optional): which episode that is [N], so that each counts once in the
-            percentile. Default: ``None``, where each counts by its steps: the same where
-            episodes are equally long.
+        episodes (Tensor, optional): number of each row's episode [N], so that each episode counts
+            once in the percentile. Default: ``None``, each counts by its number of steps, which is
+            the same for episodes of equal length.
         percentile (float): in [0, 100]. Default: 80.
-        preview (Tensor, optional): returns of earlier episodes [M], one each, of which the
-            percentile is taken. Default: ``None``, where it is that of these episodes.
+        preview (Tensor, optional): returns of earlier episodes [M], one each, used for the
+            percentile. Default: ``None``, the percentile of these episodes.
 
     Returns:
         Tensor: the rows of the best episodes, in their order.
 
     Raises:
-        ValueError: if the shapes do not fit, the percentile is out of its range, or the rows of an
-            episode disagree on its return.
+        ValueError: if the shapes do not match, the percentile is out of its range, or rows of one
+            episode have different returns.
 
     Examples:
         >>> import torch
@@ -265,7 +265,7 @@ def _bounds(low: Any, high: Any, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _varying(actions: Tensor, num_synergies: int, low: Any, high: Any) -> Tensor:
-    """The actions [N, n], if so many synergies can be found in them."""
+    """The actions [N, n], checked to vary enough for ``num_synergies`` synergies."""
     real = torch.promote_types(actions.dtype, torch.float32)
     low, high = _bounds(low, high, actions.new_zeros(actions.shape[-1:], dtype=real))
     actions = as_actions(actions, low=low, high=high, min_rows=num_synergies + 1)
