@@ -27,8 +27,8 @@ class DecoderLoss(LossModule):
         and ``action`` [*, n]; writes ``loss_decoder``. The batch is read at the keys set with
         :meth:`set_keys`, whatever the decoder's own keys are.
 
-    Deviates: only in its use. The recorded action *is* ``Dec(synergy)`` of the decoder at that
-        time. So the gradient is zero on fresh pairs, pulls back to old outputs on stale ones, and
+    Deviates: only in its use. The recorded action *is* ``Dec(synergy)`` of the decoder that acted.
+        So the gradient is zero on fresh pairs, pulls back to old outputs on stale ones, and
         carries no reward to the decoder. As the only fine-tuning signal this is the paper's literal
         reading. Next to an actor loss through the decoder it is a distillation term that keeps the
         synergies from drifting.
