@@ -1,4 +1,4 @@
-"""Where frames come from: one process, several, or several machines."""
+"""Data collection in one process, several processes, or on several machines."""
 
 from torchrl_etl.collectors.batches import Batches, CollectionError
 from torchrl_etl.collectors.factory import COLLECTORS, make_batches

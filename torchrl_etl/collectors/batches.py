@@ -1,4 +1,4 @@
-"""Batches of a collector, none of which is waited for without end."""
+"""Collector batches, with a timeout on every wait."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ __all__ = ["Batches", "CollectionError"]
 
 
 class CollectionError(RuntimeError):
-    """Workers failed, or something was waited for too long."""
+    """Workers failed, or a wait timed out."""
 
 
 class Batches:
-    """What a learner needs of any TorchRL collector: the next batch, acted with fresh weights.
+    """Batches of any TorchRL collector, each collected with the current policy weights.
 
-    Weights are pushed before each batch is asked for. With ``ahead`` the next batch is asked for
-    as soon as one is delivered, so that it is collected while the learner learns; its policy is
-    then one batch older, and everything is as reproducible as without.
+    Weights are pushed before each batch is requested. With ``ahead``, the next batch is requested
+    as soon as one is delivered and is collected while the learner updates. Its policy is then one
+    batch older; runs are as reproducible as without ``ahead``.
 
-    Workers start as this is made, and are waited for by :meth:`await_start` or whatever needs them
-    first, so that several collectors can start at once. The start must draw no random numbers in
-    this process, which goes on meanwhile.
+    The constructor starts the workers without waiting, so several collectors can start at once.
+    :meth:`await_start`, or the first method that needs the workers, waits for them. Starting must
+    draw no random numbers in this process, which continues meanwhile.
 
     Args:
         make_collector (callable): builds the collector.
 
     Keyword Args:
-        in_process (bool): whether it collects in this process, where nothing is waited for.
+        in_process (bool): whether the collector runs in this process, without timeouts.
             Default: ``False``.
         ahead (bool): collect the next batch while the learner works on this one.
             Default: ``False``.
-        restarts (bool): whether the collector can begin new episodes from a seed while it runs.
+        restarts (bool): whether a running collector can begin new episodes from a seed.
             Default: ``True``.
-        timeout (float): most seconds to wait for anything: the start (from where it is waited for
-            on), a batch, a push.
+        timeout (float): longest wait in seconds for the start (counted from the first wait),
+            a batch, or a push of weights.
             Default: 120.
 
     Raises:
-        CollectionError: from every method, if workers fail or a wait passes its limit.
+        CollectionError: from every method, if workers fail or a wait times out.
 
     Examples:
         >>> from functools import partial
@@ -84,24 +84,24 @@ class Batches:
         self._is_stuck = False
         self._collector: BaseCollector | None = None
         if self._caller is not None:
-            # With a team of OpenMP threads for the caller's operations there are more threads
-            # than cores, and libgomp puts the learner's to sleep between any two operations.
+            # A second team of OpenMP threads would exceed the cores; libgomp then puts the
+            # learner's threads to sleep between operations.
             self._caller.call(torch.set_num_threads, 1)
         self._starting: Future[BaseCollector] | None = self._call(make_collector)
         if in_process:
             self.await_start()
 
     def await_start(self) -> None:
-        """Wait until the workers are there."""
+        """Wait until the workers have started."""
         if self._collector is None:
             with _threads_kept():
                 self._collector = self._wait("start", self._starting)
             self._iterator = iter(self._collector)
 
     def restart(self, seed: int) -> None:
-        """Begin new episodes that depend on the seed and the weights alone.
+        """Begin new episodes that depend only on the seed and the weights.
 
-        A batch under way is dropped; it was never counted. A collector that cannot restart goes on.
+        Drops a pending batch, whose frames were never counted. No effect without ``restarts``.
         """
         self.await_start()
         if self._restarts:
@@ -109,11 +109,11 @@ class Batches:
                 self._wait("give a batch", self._next)
                 self._next = None
             self._do("take a seed", self._collector.set_seed, seed)
-            if self._caller is None:  # workers have been reset by that already
+            if self._caller is None:  # set_seed has already reset workers
                 self._collector.reset()
 
     def ask(self) -> None:
-        """Let workers begin with the next batch, if there are some and they have not."""
+        """Request the next batch from the workers, if there are any and none is pending."""
         if self._caller is not None and self._next is None:
             self._next = self._ask()
 
@@ -124,16 +124,16 @@ class Batches:
         return batch
 
     def close(self) -> None:
-        """Stop the workers, by force if they do not listen; again does nothing."""
+        """Stop the workers, and kill those that do not respond. Idempotent."""
         if self._starting is None:
             return
         self._timeout = min(self._timeout, 30.0)
         if not self._is_stuck:
-            with suppress(Exception):  # a failed start is told to who waits for it, if anybody does
+            with suppress(Exception):  # await_start reports a failed start to its own callers
                 self.await_start()
         collector, self._collector, self._iterator, self._next = self._collector, None, None, None
         self._starting = None
-        if self._is_stuck:  # the thread still waits for a worker; another one speaks to the rest
+        if self._is_stuck:  # its thread still waits for a worker: stop the others from a new one
             _kill(collector)
             self._caller = _Caller()
         if collector is not None:  # it has started
@@ -168,8 +168,8 @@ class Batches:
             try:
                 return future.result(min(1.0, self._timeout))
             except TimeoutError:
-                # TorchRL 0.14.1 notices a dead worker when it waits for a batch, but not when it
-                # waits for an answer.
+                # TorchRL 0.14.1 detects a dead worker while it waits for a batch, but not while
+                # it waits for a reply.
                 for index, process in enumerate(getattr(self._collector, "procs", ())):
                     if process.exitcode is not None:
                         self._is_stuck = True
@@ -193,7 +193,7 @@ class Batches:
 
 @contextmanager
 def _threads_kept() -> Iterator[None]:
-    """PyTorch keeps as many threads: those of MKL, which a process has once, and this thread's."""
+    """Restore PyTorch's thread counts: MKL's, which is global, and this thread's."""
     threads = torch.get_num_threads()
     try:
         yield
@@ -208,7 +208,7 @@ def _kill(collector: BaseCollector) -> None:
 
 
 class _Caller:
-    """Calls functions one after another, in a thread that the end of the process does not await."""
+    """Runs calls in order in a daemon thread."""
 
     def __init__(self) -> None:
         self._calls: queue.SimpleQueue[tuple[Future, Callable, tuple] | None] = queue.SimpleQueue()
@@ -227,6 +227,6 @@ class _Caller:
             future, function, args = call
             try:
                 future.set_result(function(*args))
-            except BaseException as error:  # it is for the one who waits
+            except BaseException as error:  # re-raised where the result is awaited
                 future.set_exception(error)
             del call, future, function, args

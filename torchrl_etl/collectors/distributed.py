@@ -33,19 +33,19 @@ __all__ = ["DistributedWorkers"]
 
 
 class DistributedWorkers(RemoteWorkers, DistributedCollector):
-    """TorchRL's ``DistributedCollector`` whose waits end, and whose workers take turns.
+    """TorchRL's ``DistributedCollector`` with timeouts, serving the oldest ready request first.
 
-    Workers and learner form one process group of ``torch.distributed``; batches and weights travel
-    through it. Its members are fixed, so a worker that is lost ends the run, with a message that
-    names it; on machines that come and go use :class:`~torchrl_etl.collectors.ray.RayWorkers`.
-    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold and for the
-    other arguments; ``create_env_fn`` is called once in the learner's process as well, to learn
-    what a batch looks like.
+    Workers and learner form one ``torch.distributed`` process group, which carries batches and
+    weights. Its members are fixed, so a lost worker ends the run with a message that names it. On
+    machines that come and go, use :class:`~torchrl_etl.collectors.ray.RayWorkers`.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for the entries of a batch and the
+    other arguments. ``create_env_fn`` is also called once in the learner's process, to determine
+    the layout of a batch.
 
     Keyword Args:
-        launcher (str): ``"mp"`` starts processes on this machine, ``"submitit"`` jobs (on Slurm,
-            described by ``slurm_kwargs``). Defaults to ``"mp"``.
-        tcp_port (int, optional): where the workers meet. Defaults to a free port.
+        launcher (str): ``"mp"`` starts processes on this machine; ``"submitit"`` submits Slurm
+            jobs, described by ``slurm_kwargs``. Defaults to ``"mp"``.
+        tcp_port (int, optional): rendezvous port. Defaults to a free port.
         **kwargs: see :class:`~torchrl.collectors.distributed.DistributedCollector`.
 
     Raises:
@@ -105,7 +105,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
                 [create_env_fn] * num_workers,
                 own_policy,
                 **work,
-                sync=False,  # the one protocol of TorchRL's whose answers can be polled
+                sync=False,  # TorchRL's only protocol whose replies can be polled
                 launcher=launcher,
                 tcp_port=tcp_port or _free_port(),
                 collector_kwargs=collector_kwargs,
@@ -114,15 +114,15 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             )
         self.policy, self.frames_per_batch = policy, frames_per_batch
         self._prepare(policy, sync, total_frames, timeout)
-        self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has sent the weights
+        self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has already sent the weights
 
     # Workers ---------------------------------------------------------------------------------
 
     @contextmanager
     def _starting(self, seed: int) -> Iterator[None]:
-        """Around TorchRL's constructor: seeds its workers, limits its waits, ends what fails."""
-        # TorchRL 0.14.1 takes its limit for all waits of the process group, 1000, in days; and its
-        # set_seed ends the workers, so that their main function has to seed them.
+        """Around TorchRL's constructor: seed workers, set timeouts, shut down after a failure."""
+        # TorchRL 0.14.1 reads its timeout for the process group, 1000, as days. Its set_seed ends
+        # the workers, so their main function has to seed them.
         days, main = self.timeout / 86_400, partial(_seeded_main, seed)
         mended = {"MAX_TIME_TO_CONNECT": days, "_distributed_init_collection_node": main}
         self.jobs, self._weight_sync_schemes = [], None
@@ -140,7 +140,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
                 f"output). {error}"
             ) from error
         for store in (self._store, self._weight_sync_schemes["policy"]._store):
-            store.set_timeout(timedelta(seconds=self.timeout))  # the workers' own wait for longer
+            store.set_timeout(timedelta(seconds=self.timeout))  # workers' stores wait longer
 
     def _make_container(self) -> None:
         self._tensordict_out = [self._example.clone().lock_() for _ in range(self.num_workers)]
@@ -156,10 +156,10 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         rank = worker + 1
         try:
             if self._news(worker):
-                # It is idle: no weights change within a batch.
+                # The worker is idle, so weights never change within a batch.
                 self._weight_sync_schemes["policy"].send(self._weights, worker_ids=worker)
-            # Said for the worker. TorchRL 0.14.1 lets it say so itself and until then takes the
-            # "done" of its last batch for one of the next, which it then waits for.
+            # TorchRL 0.14.1 leaves setting "busy" to the worker. Until it does, the "done" of its
+            # last batch counts for the next one, and the learner blocks on that batch.
             self._store.set(f"NODE_{rank}_status", b"busy")
             self._store.set(f"NODE_{rank}_in", b"continue")
             out = self._tensordict_out[worker]
@@ -178,7 +178,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         return worker, self._signed(self._tensordict_out[worker].clone(), worker)
 
     def _wait(self) -> int:
-        """The worker that was asked first among those that have a batch."""
+        """The worker whose request is oldest among those that have a batch."""
         pause = 0.001
         while True:
             asked = list(self._trackers)
@@ -195,14 +195,14 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             pause = min(2 * pause, 0.02)
 
     def shutdown(self, timeout: float | None = None) -> None:
-        """Asks the workers to end, and kills them after ``timeout`` (5 s); again does nothing."""
+        """Ask the workers to end, and kill them after ``timeout`` (default 5 s). Idempotent."""
         if getattr(self, "_shutdown", False):
             return
         self._shutdown = self._stopped = True
-        # Not TorchRL's: it waits for an answer of every worker, and raises if one is dead; nor does
-        # it stop the threads that wait for weights, each of which costs its worker 5 s.
+        # TorchRL's shutdown waits for a reply of every worker and raises if one is dead. It also
+        # leaves the threads that wait for weights running, which delays each worker by 5 s.
         limit = time.monotonic() + (5.0 if timeout is None else timeout)
-        with suppress(RuntimeError, AttributeError):  # the learner may have come less far
+        with suppress(RuntimeError, AttributeError):  # the constructor may have failed before
             self._store.set("TRAINER_status", b"shutdown")
             for worker in range(self.num_workers):
                 self._weight_sync_schemes["policy"]._store.set(f"NODE_{worker + 1}_in", b"stop")
@@ -219,7 +219,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             scheme.shutdown()
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
-        else:  # torch 2.13 counts a group that failed to start, and new workers do not
+        else:  # torch 2.13 counts groups that failed to start; new workers start from 0
             torch.distributed.distributed_c10d._world.group_count = 0
 
 
@@ -227,7 +227,7 @@ _main = generic._distributed_init_collection_node
 
 
 def _seeded_main(seed: int, **kwargs: Any) -> None:
-    """A worker's main function: TorchRL's, with an environment that is built and seeded here."""
+    """TorchRL's main function of a worker, with a seeded environment."""
     live_as_long_as_the_learner()
     kwargs["env_make"] = seeded_env(kwargs["env_make"], worker_seed(seed, kwargs["rank"] - 1))
     _main(**kwargs)
@@ -251,10 +251,10 @@ def _one_batch(
     collector_class: type[Collector],
     **kwargs: Any,
 ) -> TensorDictBase:
-    """What a batch of a worker looks like.
+    """An example batch of a worker.
 
-    In the place of the one that TorchRL 0.14.1 collects when the workers run already, and by the
-    base class Collector, whose batches may have other entries than collector_class's.
+    TorchRL 0.14.1 collects its example after starting the workers, and with the base class
+    Collector, whose batches may have other entries than those of ``collector_class``.
     """
     with torch.random.fork_rng(devices=[]):
         collector = collector_class(

@@ -1,4 +1,4 @@
-"""One way to every kind of collector."""
+"""Factory for all collectors."""
 
 from __future__ import annotations
 
@@ -37,34 +37,34 @@ def make_batches(
     ray: Mapping[str, Any] | None = None,
     distributed: Mapping[str, Any] | None = None,
 ) -> Batches:
-    """Batches of transitions from one process, several, or several machines.
+    """Batches of transitions from one process, several processes, or several machines.
 
     Args:
-        kind (str): ``"single"`` collects in this process; ``"process"`` in workers of which each
-            gives its part of every batch; ``"async"`` in workers that never wait, each
-            batch from one of them; ``"ray"`` on a Ray cluster; ``"distributed"`` in a
+        kind (str): ``"single"`` collects in this process; ``"process"`` in worker processes that
+            each contribute a part of every batch; ``"async"`` in worker processes that never wait,
+            with one worker's frames per batch; ``"ray"`` on a Ray cluster; ``"distributed"`` in a
             torch.distributed group.
         make_env (callable): builds a worker's environment, on the CPU.
-        policy (TensorDictModuleBase): what acts. Whatever decodes its synergies must be a part of
-            it, so that its weights travel with the policy's.
+        policy (TensorDictModuleBase): behavior policy. A synergy decoder must be part of it, so
+            that the decoder's weights are sent along.
 
     Keyword Args:
         frames_per_batch (int): frames of a batch.
-        collector_class (type): what collects in a worker. Defaults to
+        collector_class (type): class of each worker's collector. Defaults to
             :class:`~torchrl_etl.collectors.VectorCollector`, which needs batched environments.
-        num_workers (int): workers; ``"single"`` has none and ignores it.
+        num_workers (int): number of workers; ignored by ``"single"``.
         seed (int): seeds ``"ray"`` and ``"distributed"``; the others are seeded by
             :meth:`Batches.restart`.
-        ahead (bool): with ``"process"``, collect a batch while the learner works on the last.
-        timeout (float): most seconds to wait for anything.
-        device (torch.device): of the policy, with ``"single"``; workers act on the CPU.
-        ray, distributed (mapping): more arguments of
+        ahead (bool): with ``"process"``, collect the next batch while the learner updates.
+        timeout (float): longest wait in seconds.
+        device (torch.device): policy device of ``"single"``; workers act on the CPU.
+        ray, distributed (mapping): further arguments of
             :class:`~torchrl_etl.collectors.ray.RayWorkers` and
             :class:`~torchrl_etl.collectors.distributed.DistributedWorkers`.
 
     Raises:
         ValueError: for an unknown kind or bad arguments.
-        ImportError: if the engine of a kind is not installed.
+        ImportError: if Ray or submitit is needed and not installed.
     """
     check_choice("kind", kind, COLLECTORS)
     common = {"frames_per_batch": frames_per_batch, "total_frames": -1}

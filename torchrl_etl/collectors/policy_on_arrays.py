@@ -1,4 +1,4 @@
-"""A TensorDict policy evaluated on bare arrays."""
+"""A TensorDict policy evaluated on NumPy arrays."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Arrays", "PolicyOnArrays"]
 
 Arrays = dict[NestedKey, np.ndarray]
 
-# Whose modules do the same to whatever they are given, but for what _constants has.
+# Modules of these packages are traceable: _constants holds all that changes what they compute.
 _OURS = "torchrl_etl."
 _THEIRS = ("tensordict.nn.", "torchrl.modules.models.models", "torchrl.modules.tensordict_module.")
 _KNOWN = (_OURS, "torch.nn.", *_THEIRS)
@@ -32,20 +32,19 @@ _KNOWN_DISTRIBUTIONS = (_OURS, "torch.distributions.", "torchrl.modules.distribu
 
 
 class PolicyOnArrays:
-    """Calls a policy with arrays by key, and returns what it writes as arrays by key.
+    """Calls a policy with a dict of arrays and returns the entries that it writes.
 
     A policy of plain modules of ``torch.nn``, TensorDict, TorchRL and this package, without hooks
-    or log-probabilities, is traced into one graph: the same operations on the same weights without
-    Python and TensorDict in between, which the physics of each step drives out of the processor's
-    caches. (On batches as small as these ``torch.compile`` and AOTInductor are no faster, and take
-    10 to 35 s to start.)
+    or log-probabilities, is traced into one graph. The graph runs the same operations on the same
+    weights without the overhead of Python and TensorDict, whose code the physics of each step
+    evicts from the CPU caches. (On such small batches ``torch.compile`` and AOTInductor are no
+    faster, and take 10 to 35 s to start.)
 
-    In a module of another's a graph would freeze branches, counts and whatever else is Python. A
-    policy with such a one is called as it is, with a tensordict of all arrays, and everything that
-    is in it afterwards is returned, so that it finds it again if it gets it back.
+    In modules of other packages, a graph would freeze branches, counters and other Python state. A
+    policy with such a module is called with a tensordict of all arrays instead. All entries are
+    then returned, so that a stateful policy can read them in the next call.
 
-    Weights may be updated in place at any time; where anything else was changed, :meth:`refresh`
-    finds out.
+    Weights may be updated in place at any time; :meth:`refresh` detects other changes.
 
     Examples:
         >>> import numpy as np
@@ -58,7 +57,7 @@ class PolicyOnArrays:
     """
 
     foreign: list[type]
-    """Other classes than this package's that prevent a graph."""
+    """Classes from outside this package that prevent tracing."""
 
     def __init__(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> None:
         self._policy = policy
@@ -67,13 +66,13 @@ class PolicyOnArrays:
         self.refresh()
 
     def refresh(self) -> None:
-        """Look for anything else in the policy than what the graph was traced with.
+        """Discard the graph if the policy has changed in more than the values of its tensors.
 
-        It walks through the whole policy, so a rollout does it once and not at every step.
+        This walks through the whole policy: call it once per rollout, not at every step.
         """
         found = list(_constants(self._policy))
         if len(found) != len(self._constants) or any(map(is_not, found, self._constants)):
-            self._constants = found  # held, so that nothing else gets the id of one of these
+            self._constants = found  # a reference, so that no new object reuses an id
             opaque = {type(module) for module in _opaque(self._policy)}
             self.foreign = [kind for kind in opaque if not kind.__module__.startswith(_OURS)]
             self._sequence = None if opaque else _Sequence(self._policy)
@@ -81,7 +80,7 @@ class PolicyOnArrays:
 
     @torch.no_grad()
     def __call__(self, inputs: Arrays, device: torch.device | None = None) -> Arrays:
-        # What a policy of another's reads beside its keys, nobody knows.
+        # A foreign policy may read entries that are not in its in_keys.
         keys = inputs if self.foreign else self._policy.in_keys
         tensors = [torch.from_numpy(inputs[key]) for key in keys]
         if device is not None:
@@ -98,12 +97,12 @@ class PolicyOnArrays:
     def _trace(
         self, sequence: _Sequence, tensors: list[Tensor]
     ) -> Callable[..., tuple[Tensor, ...]]:
-        # A trace runs the policy once more than steps are taken.
+        # Tracing runs the policy once; undo its effect on random state and buffers.
         random, buffers = torch.get_rng_state(), list(self._policy.buffers())
         before = [buffer.clone() for buffer in buffers]
         with warnings.catch_warnings():
-            # Deprecated in PyTorch 2.13, in favour of what is slower to start (see above); and
-            # a distribution's checks of its bounds are constants, as they should be.
+            # torch.jit.trace is deprecated in PyTorch 2.13 for alternatives that start slower (see
+            # above). It also warns that a distribution's checks become constants, as intended.
             warnings.simplefilter("ignore")
             graph = torch.jit.trace(sequence, tuple(tensors), check_trace=False)
         torch.set_rng_state(random)
@@ -118,14 +117,14 @@ class _Sequence(nn.Module):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        # In a tuple, where tracing, which would stumble over tensordict's classes, does not look.
+        # A tuple hides them from tracing, which fails on tensordict's classes.
         self.leaves = tuple(_leaves(policy))
         self.functions = nn.ModuleList(
             nn.Identity() if isinstance(leaf, ProbabilisticTensorDictModule) else leaf.module
             for leaf in self.leaves
         )
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [key for key in policy.out_keys if key != "_"]  # which is for what to drop
+        self.out_keys = [key for key in policy.out_keys if key != "_"]  # "_": discarded output
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         entries = dict(zip(self.in_keys, tensors, strict=True))
@@ -151,7 +150,7 @@ def _leaves(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
 
 
 def _constants(policy: object) -> Iterator[object]:
-    """All that a graph has as it was when traced: it sees new values in tensors, and no others."""
+    """Everything that a trace freezes. Only the values of tensors may change after it."""
     yield exploration_type()
     for module in _modules(policy):
         yield module
@@ -160,7 +159,7 @@ def _constants(policy: object) -> Iterator[object]:
 
 
 def _opaque(policy: object) -> Iterator[object]:
-    """What a graph may not show all of."""
+    """Modules that a trace might not capture fully."""
     if not isinstance(policy, nn.Module):
         yield policy
     for module in _modules(policy):
@@ -174,7 +173,7 @@ def _modules(policy: object) -> Iterable[nn.Module]:
 
 
 def _is_plain(module: nn.Module) -> bool:
-    """Whether it does no more than its keys say."""
+    """Whether the module has no effect beyond reading and writing its keys."""
     if isinstance(module, TensorDictSequential):
         return not module.partial_tolerant
     if isinstance(module, ProbabilisticTensorDictModule):
@@ -188,4 +187,4 @@ def _is_plain(module: nn.Module) -> bool:
         )
     if isinstance(module, TensorDictModuleBase):
         return calls_module_only(module)
-    return getattr(module, "momentum", 0) is not None  # a batch norm without one counts
+    return getattr(module, "momentum", 0) is not None  # batch norm without momentum keeps a count

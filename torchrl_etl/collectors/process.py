@@ -1,4 +1,4 @@
-"""Collector workers in processes of this machine."""
+"""Collector workers in local processes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["AsyncProcessWorkers", "ProcessWorkers"]
 
 
 class _OwnWeights:
-    """Workers that act with a copy of the policy, renewed when the learner says so.
+    """Workers that act with a copy of the policy, updated only on request.
 
-    TorchRL 0.14.1 moves the given policy itself into shared memory, so that every optimizer step
-    reaches the workers in the middle of their rollouts.
+    TorchRL 0.14.1 moves the learner's policy into shared memory, so every optimizer step would
+    change the workers' policy during a rollout.
     """
 
     def __init__(
@@ -36,28 +36,28 @@ class _OwnWeights:
     ) -> None:
         self._learner = policy
         kwargs = {"collector_class": VectorCollector, "use_buffers": True, **kwargs}
-        with stop_signals_blocked():  # workers are born with that, and import for seconds
+        with stop_signals_blocked():  # workers inherit this; their imports take seconds
             super().__init__(
                 [create_env_fn] * num_workers,
                 deepcopy(policy).cpu(),
                 init_fn=live_as_long_as_the_learner,
-                num_threads=torch.get_num_threads(),  # TorchRL would take one from us for each
+                num_threads=torch.get_num_threads(),  # TorchRL would subtract one per worker
                 **kwargs,
             )
 
     def update_policy_weights_(
         self, policy_or_weights: TensorDictBase | nn.Module | None = None, **kwargs: Any
     ) -> None:
-        """Gives the workers weights: by default, those that the learner's policy has now."""
+        """Send weights to the workers. Default: the learner's current weights."""
         super().update_policy_weights_(
             self._learner if policy_or_weights is None else policy_or_weights, **kwargs
         )
 
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Stop the workers, and what carries weights to them.
+        """Stop the workers and the weight-sync schemes.
 
-        TorchRL 0.14.1 leaves the latter to its ``__del__``, which hangs if it is called by the end
-        of the process, when no thread can be started any more.
+        TorchRL 0.14.1 stops the schemes in ``__del__``, which hangs at interpreter exit, when no
+        thread can be started.
         """
         super().shutdown(*args, **kwargs)
         for scheme in (self._weight_sync_schemes or {}).values():
@@ -65,14 +65,13 @@ class _OwnWeights:
 
 
 class ProcessWorkers(_OwnWeights, MultiSyncCollector):
-    """TorchRL's ``MultiSyncCollector``: a batch is made of one part from each worker.
+    """TorchRL's ``MultiSyncCollector``: each batch has one part from each worker.
 
-    Every rollout acts with the weights of the last :meth:`update_policy_weights_` before it was
-    asked for, from its first step to its last.
+    A whole rollout uses the weights of the last :meth:`update_policy_weights_` before its request.
 
     Args:
         create_env_fn (callable): builds a worker's environment.
-        policy (TensorDictModuleBase): what acts; workers get a copy.
+        policy (TensorDictModuleBase): behavior policy; workers get a copy.
 
     Keyword Args:
         num_workers (int): number of processes.
@@ -94,10 +93,10 @@ class ProcessWorkers(_OwnWeights, MultiSyncCollector):
 
 
 class AsyncProcessWorkers(_OwnWeights, MultiAsyncCollector):
-    """TorchRL's ``MultiAsyncCollector``: each batch is one worker's, and workers never wait.
+    """TorchRL's ``MultiAsyncCollector``: each batch is from one worker, and workers never wait.
 
-    New weights land in the middle of rollouts. What was executed is recorded as it happens, so
-    transitions stay true; only their policy is a mixture.
+    New weights may arrive during a rollout. Transitions record the executed actions and stay
+    valid; only their behavior policy is a mixture.
 
-    Args and Keyword Args as for :class:`ProcessWorkers`, but ``frames_per_batch`` is of one worker.
+    Arguments are those of :class:`ProcessWorkers`, with ``frames_per_batch`` per worker.
     """

@@ -29,25 +29,25 @@ __all__ = ["RayWorkers"]
 
 
 class RayWorkers(RemoteWorkers, RayCollector):
-    """TorchRL's :class:`~torchrl.collectors.distributed.RayCollector` that survives its workers.
+    """TorchRL's :class:`~torchrl.collectors.distributed.RayCollector` that replaces lost workers.
 
-    Each worker is a Ray actor that runs ``collector_class`` on one (batched) environment. What
-    is added: weights travel through Ray's object store, in the order of the requests for
-    batches; every wait has a limit; a worker that is lost, or gives no answer in time, is
-    replaced by one with the newest weights and a seed of its own, ``replacements`` times.
-    The batch it had under way is never delivered, so no frame is counted twice.
-    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for what a batch may hold and for the
-    other arguments; a replacement has to start and collect within ``timeout``.
+    Each worker is a Ray actor that runs ``collector_class`` on one (batched) environment. Weights
+    are sent through Ray's object store, in order with the requests for batches. Every wait has a
+    timeout. A worker that is lost or late is replaced, up to ``replacements`` times in all, by one
+    with the newest weights and a seed of its own. The pending batch of a lost worker is never
+    delivered, so no frame is counted twice.
+    See :class:`~torchrl_etl.collectors.remote.RemoteWorkers` for the entries of a batch and the
+    other arguments. A replacement has to start and collect a batch within ``timeout``.
 
     Keyword Args:
         replacements (int): lost workers to replace before giving up. Defaults to 3.
         address (str, optional): Ray cluster to join: ``"auto"``, ``"host:port"`` or
-            ``"ray://host:port"``. By default a local one is started, and ended by
-            :meth:`shutdown`. Where Ray is running in this process already, it is used.
-        ray_init_config (mapping, optional): more arguments for ``ray.init``.
-        remote_configs (mapping, optional): what Ray reserves for a worker and where it is placed,
-            as in ``ray.remote``. Defaults to ``{"num_cpus": 1}``; Ray gives a worker as many
-            OpenMP threads as CPUs.
+            ``"ray://host:port"``. By default a local cluster is started, and stopped by
+            :meth:`shutdown`. If Ray is already initialized in this process, it is used.
+        ray_init_config (mapping, optional): further arguments of ``ray.init``.
+        remote_configs (mapping, optional): resources and placement of a worker, as in
+            ``ray.remote``. Defaults to ``{"num_cpus": 1}``; a worker gets as many OpenMP threads
+            as CPUs.
         **kwargs: see :class:`~torchrl.collectors.distributed.RayCollector`.
 
     Raises:
@@ -117,9 +117,8 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 collector_kwargs=collector_kwargs,
                 ray_init_config={**cluster, **(ray_init_config or {})},
                 remote_configs=remote_configs,
-                # Weights are not left to a scheme. The one of TorchRL 0.14.1 joins all workers in
-                # a process group that a replacement cannot enter, waits for batches under way, and
-                # fails after 60 s of waiting.
+                # TorchRL 0.14.1's weight-sync scheme joins all workers in a process group, which a
+                # replacement cannot enter. It also waits for pending batches and fails after 60 s.
                 weight_updater=RemoteModuleWeightUpdater(),
                 **kwargs,
             )
@@ -128,7 +127,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
 
     @contextmanager
     def _starting(self) -> Iterator[None]:
-        """Around TorchRL's constructor: awaits the workers it starts, and ends what fails."""
+        """Around TorchRL's constructor: wait for the workers, shut down after a failure."""
         try:
             yield
             self._await_start()
@@ -145,7 +144,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         self._remote_collectors.extend(self._start(worker) for worker in range(len(create_env_fn)))
 
     def _start(self, worker: int) -> Any:
-        """A new actor with the newest weights and a seed that none had before."""
+        """A new actor with the newest weights and an unused seed."""
         kwargs, config = (of_workers[worker] for of_workers in self._recipe)
         seed = worker_seed(self.seed, self.started)
         self.started += 1
@@ -181,7 +180,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
 
         try:
             return ray.get(future, timeout=self.timeout)
-        except ray.exceptions.RayTaskError as error:  # its own code; a replacement would repeat it
+        except ray.exceptions.RayTaskError as error:  # a replacement would fail likewise
             raise self._lost(worker, f"failed: {error}") from error
 
     # Batches ---------------------------------------------------------------------------------
@@ -191,7 +190,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
 
         actor, push = self._remote_collectors[worker], None
         if self._news(worker):
-            # One copy in the object store for all workers; nodes pass it on among themselves.
+            # One copy in the object store serves all workers.
             if getattr(self, "_stored", (None,))[0] is not self._weights:
                 self._stored = self._weights, ray.put(self._weights)
             push = actor.update_policy_weights_.remote(self._stored[1])
@@ -239,7 +238,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         self._ask(worker)
 
     def shutdown(self, timeout: float | None = None, shutdown_ray: bool = False) -> None:
-        """Ends the workers, and the Ray that was started for them; again does nothing."""
+        """Stop the workers, and Ray if it was started for them. Idempotent."""
         self._stopped = True
         self._pending.clear()
         super().shutdown(timeout, shutdown_ray)
@@ -250,20 +249,20 @@ def _cluster(address: str | None, cpus: int) -> dict[str, Any]:
     if importlib.util.find_spec("ray") is None:
         raise ImportError("RayWorkers needs Ray: pip install 'torchrl_etl[ray]'.")
     config = {"address": address or "local", "log_to_driver": False, "logging_level": "error"}
-    if address is None:  # how many workers this machine can bear is the caller's to say
+    if address is None:  # the caller decides how many workers fit this machine
         config |= {"num_cpus": max(cpus + 1, os.cpu_count()), "include_dashboard": False}
     return config
 
 
 def _seeded(collector_class: type[Collector]) -> type[Collector]:
-    """The class as it runs in a worker, which it seeds before all else. Ray sends it by value."""
+    """A subclass that first seeds its worker process. Ray sends it by value."""
 
     class Seeded(collector_class):
         def __init__(self, create_env_fn, policy, seed, **kwargs):
             super().__init__(seeded_env(create_env_fn, seed), policy, **kwargs)
 
-        # Ray asks for an actor's truth when it reports an exception. TorchRL 0.14.1 answers with
-        # its length, which is infinite: the worker would die, and the exception be lost.
+        # Ray calls bool() on an actor to report an exception. TorchRL 0.14.1 falls back on len(),
+        # which is infinite: the worker would die, and the exception would be lost.
         def __bool__(self):
             return True
 

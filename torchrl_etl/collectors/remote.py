@@ -1,4 +1,4 @@
-"""What collectors with workers on other machines share: seeds, weights, order of batches, words."""
+"""Common code of the Ray and torch.distributed collectors: seeds, weights, requests, errors."""
 
 from __future__ import annotations
 
@@ -32,42 +32,41 @@ MANAGED |= {"split_trajs", "replay_buffer", "weight_updater", "weight_sync_schem
 
 
 class RemoteWorkers:
-    """The loop of a learner whose batches come from workers that it shares no memory with.
+    """Collection loop for workers that share no memory with the learner.
 
-    A worker is asked for one batch at a time. With the request go the newest weights, unless the
-    worker has them; so a batch is collected with one set of weights from its first frame to
-    its last, and however often the learner pushes, a worker receives weights once a batch.
+    Each worker has at most one pending request. The newest weights are sent with it, unless the
+    worker already has them. A batch is thus collected with one set of weights, and a worker
+    receives weights at most once per batch, however often the learner pushes.
 
-    Synchronous: all workers are asked at once and their batches stacked, ``[workers, *batch]``. A
-    push is in the very next batch. Asynchronous: batches come as they are ready, and a worker is
-    asked again before the learner gets its batch. When the learner pushes, one batch a worker is
-    under way (or waits to be fetched) with older weights; the one after it has the new ones.
+    Synchronous: all workers are asked at once and their batches are stacked,
+    ``[workers, *batch]``. A push takes effect in the next batch. Asynchronous: batches arrive as
+    they are ready, and a worker gets its next request before the learner gets the batch. After a
+    push, each worker delivers one more batch collected with older weights.
 
-    Each batch says where it comes from: ``("collector", "worker")`` is the index of the worker and
-    ``("collector", "policy_version")`` the number of pushes when it was asked for.
+    Each batch records its origin: ``("collector", "worker")`` is the index of the worker and
+    ``("collector", "policy_version")`` the number of pushes before the request.
 
-    Subclasses are TorchRL collectors; they define how a worker is asked and how its answer comes.
+    Subclasses are TorchRL collectors that implement the requests and replies.
 
     Args:
         create_env_fn (callable): builds a worker's environment.
-        policy (TensorDictModuleBase): what workers act with. It is copied; changes to its
-            parameters reach the workers through :meth:`update_policy_weights_`.
+        policy (TensorDictModuleBase): behavior policy. Workers get a copy, which
+            :meth:`update_policy_weights_` updates.
 
     Keyword Args:
         num_workers (int): number of workers.
-        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else of the one
-            worker that it comes from.
-        total_frames (int): iteration ends there. Defaults to -1: no end.
+        frames_per_batch (int): frames of a batch: over all workers if ``sync``, else per worker.
+        total_frames (int): frames after which iteration ends. Defaults to -1: no limit.
         sync (bool): one stacked batch of all workers instead of the first that is ready.
             Defaults to ``False``.
-        seed (int): each worker gets its own seed from it. Defaults to 0.
-        timeout (float): most seconds to wait for anything. Defaults to 300.
+        seed (int): determines the seed of each worker. Defaults to 0.
+        timeout (float): longest wait in seconds. Defaults to 300.
         collector_class (type): class of the workers' collectors. Defaults to
             :class:`~torchrl.collectors.Collector`.
-        collector_kwargs (mapping, optional): more arguments for it.
+        collector_kwargs (mapping, optional): further arguments of ``collector_class``.
 
     Raises:
-        TypeError, ValueError: for bad arguments, before anything is started.
+        TypeError, ValueError: for bad arguments, before workers are started.
         RuntimeError: if workers do not start in time, or are lost.
     """
 
@@ -76,7 +75,7 @@ class RemoteWorkers:
 
     def _prepare(self, policy: nn.Module, sync: bool, total_frames: int, timeout: float) -> None:
         self.timeout, self._sync = timeout, sync
-        # TorchRL 0.14.1 takes the -1 of "no limit" for a limit that is reached already.
+        # TorchRL 0.14.1 treats -1 ("no limit") as a limit that has been reached.
         self.total_frames = sys.maxsize if total_frames < 0 else total_frames
         self.collected_frames, self._stopped = 0, False
         self.policy_version, self._known = 0, {}
@@ -84,11 +83,11 @@ class RemoteWorkers:
 
     @abstractmethod
     def _ask(self, worker: int) -> None:
-        """Sends the worker :attr:`_weights` if they are news to it, and asks it for a batch."""
+        """Send the worker :attr:`_weights` if it lacks them, and request a batch."""
 
     @abstractmethod
     def _take(self) -> tuple[int, TensorDictBase]:
-        """The next batch of any worker that was asked, within the limit."""
+        """The next batch of any worker with a pending request, within the timeout."""
 
     def iterator(self) -> Iterator[TensorDictBase]:
         workers = range(self.num_workers)
@@ -108,13 +107,13 @@ class RemoteWorkers:
             yield batch
 
     def _signed(self, batch: TensorDictBase, worker: int) -> TensorDictBase:
-        """The batch with its origin; to be called before the worker is asked again."""
+        """The batch with its origin. Call it before the worker's next request."""
         batch["collector", "worker"] = torch.full(batch.shape, worker)
         batch["collector", "policy_version"] = torch.full(batch.shape, self._known[worker])
         return batch
 
     def _news(self, worker: int) -> bool:
-        """Whether the worker lacks the newest weights; it counts as having them from now on."""
+        """Whether the worker lacks the newest weights. Marks them as sent."""
         news = self._known.get(worker) != self.policy_version
         self._known[worker] = self.policy_version
         return news
@@ -122,17 +121,17 @@ class RemoteWorkers:
     def update_policy_weights_(
         self, policy_or_weights: nn.Module | TensorDictBase | None = None
     ) -> None:
-        """Makes weights those of every batch that is asked for from now on; returns at once.
+        """Set the weights for all later requests. Returns at once.
 
         Args:
             policy_or_weights (nn.Module or TensorDictBase, optional): a policy, or its weights.
-                Defaults to the policy of the constructor as it is now.
+                Defaults to the current weights of the constructor's policy.
         """
         self._weights = weights_of(self.policy if policy_or_weights is None else policy_or_weights)
         self.policy_version += 1
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Not possible once workers run: pass ``seed`` to the constructor."""
+        """Always raises: workers are seeded when they start; pass ``seed`` to the constructor."""
         raise RuntimeError(
             f"{type(self).__name__} seeds its workers when they start: pass seed={seed} to the "
             "constructor, or build a new collector."
@@ -149,10 +148,10 @@ class RemoteWorkers:
 
 
 def seeded_env(create_env_fn: Callable[[], EnvBase], seed: int) -> EnvBase:
-    """In a worker: the environment, with its simulators and torch's generator seeded.
+    """Build a worker's environment, with its simulators and torch's generator seeded.
 
-    A fresh process seeds torch by chance and a forked one inherits the generator of its parent;
-    seeded here, workers differ, and what they do can be repeated.
+    Otherwise a spawned process would seed torch randomly, and a forked one would inherit its
+    parent's generator. With a seed each, workers differ and are reproducible.
     """
     torch.manual_seed(seed)
     env = create_env_fn()
@@ -161,9 +160,9 @@ def seeded_env(create_env_fn: Callable[[], EnvBase], seed: int) -> EnvBase:
 
 
 def training_seed(seed: int, offset: int) -> int:
-    """A seed for the part of a run that ``offset`` names.
+    """A seed for the part of a run given by ``offset``.
 
-    It has its highest bit set, which no evaluation seed has.
+    Bit 30 is set, which it is in no evaluation seed.
 
     Examples:
         >>> training_seed(0, 0) == 2**30
@@ -177,7 +176,7 @@ def training_seed(seed: int, offset: int) -> int:
 def worker_seed(seed: int, index: int) -> int:
     """Seed of the ``index``-th worker of a run.
 
-    Steps of the golden ratio of the range keep the seeds of any number of workers apart.
+    Golden-ratio steps keep the seeds of any number of workers apart.
 
     Examples:
         >>> len({worker_seed(0, index) for index in range(1000)})
@@ -194,7 +193,7 @@ def weights_of(policy: nn.Module | TensorDictBase) -> TensorDictBase:
 
 
 def cpu_copy(policy: TensorDictModuleBase) -> TensorDictModuleBase:
-    """What workers start with; their machines may lack the learner's device."""
+    """A copy on the CPU for workers, whose machines may lack the learner's device."""
     return deepcopy(policy).to("cpu")
 
 
@@ -209,7 +208,7 @@ def check_arguments(
     collector_class: Any,
     collector_kwargs: Mapping[str, Any],
 ) -> None:
-    """Raises ValueError or TypeError with what was got, what is expected and how to mend it."""
+    """Raise ValueError or TypeError with the value, what is expected, and a fix."""
     if not callable(create_env_fn) or isinstance(create_env_fn, EnvBase):
         raise TypeError(
             f"create_env_fn is a {type(create_env_fn).__name__}; workers build their own "

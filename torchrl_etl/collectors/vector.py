@@ -1,4 +1,4 @@
-"""A collector that steps a vector of simulators without TorchRL's work per step."""
+"""A collector that steps a vector of simulators without TorchRL's per-step overhead."""
 
 from __future__ import annotations
 
@@ -37,36 +37,35 @@ _NOT_TAKEN = ("replay_buffer", "max_frames_per_traj", "track_policy_version", "c
 
 
 class VectorCollector(Collector):
-    """TorchRL's ``Collector``, several times cheaper per step on vectorised Gymnasium tasks.
+    """TorchRL's ``Collector``, several times cheaper per step on vectorized Gymnasium tasks.
 
-    The environment is an ordinary one: :func:`~torchrl_etl.envs.make_env` with ``num_envs`` above
-    one, under any of ``RewardSum``, ``InitTracker``,
-    :class:`~torchrl_etl.transforms.SynergyAction` and transforms that say on arrays what they do,
-    as :class:`~torchrl_etl.transforms.DirectionPrimer` does in ``array_step(now, after)``, which
-    writes what a step leaves below ``"next"``, and in ``array_reset(now, fresh, done)``, which
-    writes the root that the next step starts from, where episodes ended.
+    The environment is :func:`~torchrl_etl.envs.make_env` with ``num_envs`` above one. Allowed
+    transforms are ``RewardSum``, ``InitTracker``, :class:`~torchrl_etl.transforms.SynergyAction`
+    and those with two methods on arrays, such as
+    :class:`~torchrl_etl.transforms.DirectionPrimer`. ``array_step(now, after)`` writes entries
+    below ``"next"`` after a step. ``array_reset(now, fresh, done)`` writes the root entries that
+    the next step starts from where episodes ended.
 
-    TorchRL steps it through specs, clones and containers that cost more than a hand's physics; this
-    rollout does the same arithmetic on arrays and fills one tensordict at the end. Transitions are
-    bit by bit those of ``Collector``.
+    TorchRL's specs, clones and containers cost more per step than a hand's physics. This rollout
+    does the same arithmetic on arrays and fills one tensordict at the end. Its transitions are
+    bitwise equal to those of ``Collector``.
 
-    It keeps random numbers of its own, begun anew by :meth:`set_seed`. What it collects depends on
-    the seed and the weights alone: not on what else runs in the process, nor on which process
-    that is.
+    The collector has its own random state, reset by :meth:`set_seed`. Its data depend only on the
+    seed and the weights, not on the process or on other code in it.
 
     Args:
-        create_env_fn (EnvBase or callable): the environment, or what builds it.
-        policy (TensorDictModule): what acts in it; random actions if there is none. A sequence of
-            plain modules of ``torch.nn``, TensorDict, TorchRL and this package is evaluated on bare
-            tensors, as one graph. Another, of which a graph might miss something, is called with a
-            tensordict, which is told in a warning unless all of it is this package's.
+        create_env_fn (EnvBase or callable): the environment, or a function that builds it.
+        policy (TensorDictModule): behavior policy. Default: random actions. A sequence of plain
+            modules of ``torch.nn``, TensorDict, TorchRL and this package is traced into one graph
+            on tensors. A policy that a trace might not capture is called with a tensordict, with a
+            warning if a module from outside this package is the cause.
         **kwargs: see :class:`torchrl.collectors.Collector`. The policy is trusted, and the batch
             is one preallocated tensordict.
 
     Raises:
-        ValueError: if the environment is not such a one, or for ``replay_buffer``,
-            ``max_frames_per_traj``, ``track_policy_version`` and ``compact_obs``; use
-            ``torchrl.collectors.Collector``.
+        ValueError: for any other environment, or for ``replay_buffer``, ``max_frames_per_traj``,
+            ``track_policy_version`` and ``compact_obs``. Use ``torchrl.collectors.Collector``
+            for these.
 
     Examples:
         >>> from torchrl.envs import RewardSum, TransformedEnv
@@ -118,7 +117,7 @@ class VectorCollector(Collector):
 
     @staticmethod
     def takes(transform: Transform) -> bool:
-        """Whether an environment may have this transform."""
+        """Whether the collector supports this transform."""
         offers = hasattr(transform, "array_step") and hasattr(transform, "array_reset")
         return offers or type(transform) in _KNOWN
 
@@ -128,7 +127,7 @@ class VectorCollector(Collector):
         return super().set_seed(seed, static_seed)
 
     def reset(self, index: Any = None, **kwargs: Any) -> None:
-        """Start new episodes, see :meth:`torchrl.collectors.Collector.reset`."""
+        """Start new episodes; see :meth:`torchrl.collectors.Collector.reset`."""
         with self._own_random_numbers():
             super().reset(index, **kwargs)
 
@@ -160,7 +159,7 @@ class VectorCollector(Collector):
         rows: dict[NestedKey, list[np.ndarray]] = defaultdict(list)
         for _ in range(self.frames_per_batch):
             written, after = self._step(now)
-            now |= written  # stays there, for a policy that goes on from what it wrote
+            now |= written  # stays there, for stateful policies
             for key in now.keys() & recorded:
                 rows[key].append(now[key])
             for key, value in after.items():
@@ -172,11 +171,11 @@ class VectorCollector(Collector):
         for key, values in rows.items():
             batch[key].copy_(torch.from_numpy(np.stack(values, axis=1)))
         for key, value in now.items():
-            carrier.set(key, torch.tensor(value))  # a copy: a policy may write its own buffers
+            carrier.set(key, torch.tensor(value))  # a copy: a policy may reuse its output buffers
         return batch
 
     def _step(self, now: Arrays) -> tuple[Arrays, Arrays]:
-        """What the policy writes at the root, and what the step writes below ``"next"``."""
+        """The policy's root entries, and the entries of the step below ``"next"``."""
         written = self._policy_on_arrays(now, self.policy_device)
         after: Arrays = {}
         if self._synergy_action is None:
@@ -202,7 +201,7 @@ class VectorCollector(Collector):
         return written, after
 
     def _restart(self, now: Arrays, done: np.ndarray) -> Arrays:
-        """The entries at the root that the next step starts from, where episodes ended."""
+        """Root entries of the next step, with those of ended episodes reset."""
         fresh = _named(self._simulators.reset(options={"reset_mask": done})[0])
         for key in self.env.done_keys:
             fresh[key] = np.zeros_like(now[key])
@@ -229,7 +228,7 @@ def _named(observations: Arrays | np.ndarray) -> Arrays:
 
 
 def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[Transform]]:
-    """The simulators under an environment, and its transforms, the innermost first."""
+    """The simulators of an environment, and its transforms from the inside out."""
     transforms: list[Transform] = []
     while isinstance(env, TransformedEnv):
         transforms = [*getattr(env.transform, "transforms", [env.transform]), *transforms]

@@ -1,4 +1,4 @@
-"""How a worker process behaves: it lives as long as its learner, and no longer."""
+"""Worker processes that live exactly as long as their learner."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ __all__ = [
     "stop_signals_blocked",
 ]
 
-# What asks a run to save and leave: Ctrl-C, kill and Slurm, Slurm's --signal, a closed terminal.
+# Signals on which a run saves and exits: Ctrl-C, kill and Slurm, Slurm's --signal, a hangup.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
 def live_as_long_as_the_learner() -> None:
-    """In a worker: leave signals to the learner, and end when it has ended, however it did.
+    """Call it in a worker: ignore stop signals, and exit when the learner's process has ended.
 
-    A terminal and a batch system send their signals to every process of a run. The learner needs
-    its workers until it has saved; it then stops them by itself.
+    Terminals and batch systems signal every process of a run. The learner needs its workers until
+    it has saved, and then stops them itself.
     """
     learner = multiprocessing.parent_process()
-    if learner is None:  # a job of its own, which nobody but the signal would end
+    if learner is None:  # a separate job, which only the signal would end
         return
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
@@ -38,10 +38,9 @@ def live_as_long_as_the_learner() -> None:
 
 @contextmanager
 def stop_signals_blocked() -> Iterator[None]:
-    """Let processes that are started here begin life deaf to stop signals.
+    """Processes started in this block inherit a mask that blocks stop signals.
 
-    Those that come meanwhile are not lost: they reach the learner through its other threads, or
-    at the end of the block.
+    No signal is lost: the learner receives it in another thread, or at the end of the block.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
@@ -51,10 +50,10 @@ def stop_signals_blocked() -> Iterator[None]:
 
 
 def start_resource_tracker() -> None:
-    """Start Python's resource tracker, which the first lock would start, deaf to stop signals.
+    """Start Python's resource tracker, before the first lock does, with stop signals blocked.
 
-    By itself it is deaf to Ctrl-C and SIGTERM alone; another signal to all processes of a run would
-    end it, and each lock that it knew of is then a traceback when the run ends.
+    The tracker itself ignores only Ctrl-C and SIGTERM. Another signal to all processes of a run
+    would end it, and the run would then end with a traceback for each lock.
     """
     with stop_signals_blocked():
         resource_tracker.ensure_running()
