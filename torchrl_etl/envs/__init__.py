@@ -1,4 +1,4 @@
-"""Environments: named tasks, one factory, and a small analytic system."""
+"""Environments: named tasks, a factory for them, and a small analytic system."""
 
 import gymnasium
 

@@ -1,4 +1,4 @@
-"""Which action spaces synergies can be found in."""
+"""Checks that a task's action space admits synergies."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from gymnasium.wrappers import TransformAction
 __all__ = ["check_action_space", "flat_action"]
 
 _LARGEST_BOUND = 1e6
-"""Bounds beyond are no bounds: MuJoCo and DMControl write 1e10 for a motor without limits."""
+"""Larger bounds count as unbounded: MuJoCo and DMControl write 1e10 for a motor without limits."""
 
 
 def flat_action(env: gym.Env) -> gym.Env:
-    """The environment with an action of any shape as one flat array of actuators."""
+    """The environment with its action flattened to one array of actuators."""
     box = env.action_space
     flat = spaces.Box(box.low.ravel(), box.high.ravel(), dtype=box.dtype.type)
     return TransformAction(env, lambda action: np.reshape(action, box.shape), flat)
 
 
 def check_action_space(space: spaces.Space, task: str) -> None:
-    """Refuses actions, of any shape, in which no synergy can be learned.
+    """Reject action spaces, of any shape, in which no synergy can be learned.
 
     Raises:
-        ValueError: unless the space is a box of real numbers, with bounds below 1e6 in magnitude
-            and some room between them for every actuator.
+        ValueError: unless the space is a floating-point ``Box`` with low < high for every
+            actuator, and bounds of at most 1e6 in magnitude.
     """
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise ValueError(

@@ -16,13 +16,13 @@ __all__ = ["AnalyticOveractuated"]
 class AnalyticOveractuated(gym.Env):
     """Many muscles drive few joints towards a goal, through a fixed linear map.
 
-    Only the projection of the action on a known ``num_joints``-dimensional subspace has an effect,
-    so a learner that finds this subspace faces an easy task: that is the situation of the
-    paper with everything else left out. Uniform random actions on 16 muscles drive a joint with a
-    sixth (root mean square) of what coordinated ones reach, and their effects average out.
+    This is the paper's setting reduced to its core. Only the projection of the action on a known
+    ``num_joints``-dimensional subspace has an effect, so the task is easy within this subspace.
+    Uniform random actions on 16 muscles drive a joint at a sixth (root mean square) of the drive
+    that coordinated actions reach, and their effects average out.
 
     Registered as ``torchrl_etl/Overactuated-v0`` and, with random goals,
-    ``torchrl_etl/OveractuatedRandom-v0``, both with 25 steps an episode;
+    ``torchrl_etl/OveractuatedRandom-v0``, both with episodes of 25 steps.
     ``make_env("overactuated", goal=...)`` builds them.
 
     Args:
@@ -30,9 +30,9 @@ class AnalyticOveractuated(gym.Env):
         num_joints (int): j, number of joints. Defaults to 2.
 
     Keyword Args:
-        goal (str): ``"fixed"`` keeps one goal for the life of the map, ``"random"`` draws
-            one at each reset. Defaults to ``"fixed"``.
-        matrix_seed (int): draws the map (and the fixed goal). Defaults to 0.
+        goal (str): ``"fixed"`` draws one goal along with the map, ``"random"`` draws one at each
+            reset. Defaults to ``"fixed"``.
+        matrix_seed (int): seed of the map and the fixed goal. Defaults to 0.
         effort (float): weight of the mean squared action in the reward. Defaults to 0.01.
         tolerance (float): distance below which the goal is met. Defaults to 0.1.
 
@@ -95,7 +95,7 @@ class AnalyticOveractuated(gym.Env):
 
     @property
     def synergy_basis(self) -> np.ndarray:
-        """An orthonormal basis of the map's row space, [j, n]: what synergies should span."""
+        """An orthonormal basis of the map's row space, [j, n], which synergies should span."""
         return self._basis.copy()
 
     @property

@@ -1,4 +1,4 @@
-"""Arguments of a simulator that it does not know, in one sentence."""
+"""Error messages for simulator arguments that do not exist."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["argument_errors", "check_known"]
 
 @contextmanager
 def argument_errors(name: str, env_kwargs: Mapping[str, Any]) -> Iterator[None]:
-    """Name the task and the arguments where a simulator says "unexpected keyword" alone."""
+    """Add the task and its arguments to a simulator's "unexpected keyword" error."""
     try:
         yield
     except TypeError as error:
@@ -28,10 +28,10 @@ def argument_errors(name: str, env_kwargs: Mapping[str, Any]) -> Iterator[None]:
 
 
 def check_known(env: gym.Env, name: str, env_kwargs: Mapping[str, Any]) -> None:
-    """Refuse arguments that the constructors of an environment take and ignore.
+    """Reject arguments that an environment's constructors accept and ignore.
 
-    MyoSuite's end in ``**kwargs`` that nobody reads. An argument is known if a constructor has it
-    as a parameter, or its code names it (``kwargs.pop("model_recipe", None)``).
+    MyoSuite's constructors accept unused ``**kwargs``. An argument is known if a constructor has
+    it as a parameter, or if its code names it (``kwargs.pop("model_recipe", None)``).
 
     Raises:
         ValueError: naming the argument and the nearest known ones.

@@ -1,4 +1,4 @@
-"""Which joints of a simulation are the body's own, which of them float, and how they are held."""
+"""Joints of the body and free joints of a MuJoCo model, and holding joints in place."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["HeldJoints", "body_joints", "has_free_root", "root_joints"]
 
 
 def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Which joints [njnt] are in a kinematic tree that an actuator acts on.
+    """Mask [njnt] of the joints in kinematic trees that an actuator acts on.
 
-    The others are those of objects, whether they float, slide or turn. A joint of the body that no
-    actuator moves, such as the pole of a cart, is the body's all the same.
+    Other joints belong to objects, whether these float, slide or turn. The mask includes joints
+    of the body that no actuator moves, such as the hinge of cartpole's pole.
 
     Args:
-        model, data: of :func:`~torchrl_etl.envs.mujoco_state`, after a reset.
+        model, data: from :func:`~torchrl_etl.envs.mujoco_state`, after a reset.
 
     Examples:
         >>> from torchrl_etl.envs import make_env, mujoco_state
@@ -31,7 +31,7 @@ def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
         >>> body_joints(*mujoco_state(env))
         array([ True,  True])
     """
-    import mujoco  # there, since its model is
+    import mujoco  # installed, since the model exists
 
     moments = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
@@ -42,18 +42,18 @@ def body_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def root_joints(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Which joints [njnt] let the body float freely; arguments as for :func:`body_joints`."""
-    import mujoco  # there, since its model is
+    """Mask [njnt] of the body's free joints; arguments as for :func:`body_joints`."""
+    import mujoco  # installed, since the model exists
 
     return body_joints(model, data) & (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
 
 
 def has_free_root(env: EnvBase) -> bool:
-    """Whether the body that actuators move floats freely, as legs do and a hand does not.
+    """Whether the actuated body has a free root joint, as legs do and hands do not.
 
     Args:
-        env (EnvBase): of :func:`~torchrl_etl.envs.make_env`; it is reset. An environment without
-            MuJoCo has no free root.
+        env (EnvBase): from :func:`~torchrl_etl.envs.make_env`; this resets it. An environment
+            without MuJoCo has no free root.
 
     Examples:
         >>> from torchrl_etl.envs import make_env
@@ -69,11 +69,11 @@ def has_free_root(env: EnvBase) -> bool:
 
 
 class HeldJoints:
-    """Joints that can be put back to where they were remembered, at rest.
+    """Joints that can be restored to a remembered pose, with zero velocity.
 
     Args:
-        model, data: of :func:`~torchrl_etl.envs.mujoco_state`, after a reset, which is remembered.
-        joints (np.ndarray): which joints [njnt] are held.
+        model, data: from :func:`~torchrl_etl.envs.mujoco_state`, in the first pose to remember.
+        joints (np.ndarray): mask [njnt] of the joints to hold.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, joints: np.ndarray) -> None:
@@ -91,5 +91,5 @@ class HeldJoints:
 
 
 def _entries(joints: np.ndarray, first: np.ndarray, size: int) -> np.ndarray:
-    """Which entries of qpos or qvel [size] are of these joints, that begin at ``first``."""
+    """Mask [size] over qpos or qvel of these joints, whose entries begin at ``first``."""
     return np.repeat(joints, np.diff(first, append=size))

@@ -1,4 +1,4 @@
-"""Synergies of a body's moment arms: each is the torque of one joint, or of several together."""
+"""Synergies from a body's moment arms: each drives one joint, or a combination of joints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_etl.modules import SynergyDecoder
 
 __all__ = ["body_decoder", "body_synergies", "muscle_changes"]
 
-# Combinations of joints that muscles turn less than so much, beside the one they turn most, would
+# Relative cutoff for singular values. Combinations of joints that muscles can barely turn would
 # take all of their strength.
 WEAKEST = 0.1
 
@@ -21,19 +21,19 @@ WEAKEST = 0.1
 def body_synergies(
     env: EnvBase, num_synergies: int | None = None, *, rest: float = 0.25
 ) -> SynergyDecoder:
-    """A decoder whose coefficients are joint torques, by a body's moment arms; nothing is learned.
+    """A decoder from joint torques to actions, computed from moment arms without learning.
 
-    Coefficients of 0 hold every muscle at the activation ``rest``. A coefficient of 1 alone adds
-    the torque of its joint: the muscle that pulls most for it comes to about full activation, its
-    opponents to none. See :func:`muscle_changes` and :meth:`SynergyDecoder.from_directions`.
+    With all coefficients at 0, every muscle has the activation ``rest``. Setting one coefficient
+    to 1 adds a torque at its joint: the strongest agonist comes to about full activation, its
+    antagonists to none. See :func:`muscle_changes` and :meth:`SynergyDecoder.from_directions`.
 
     Args:
-        env (EnvBase): a body that is moved by muscles alone, after a reset.
-        num_synergies (int, optional): d, at most one for each of the J joints that muscles turn.
-            Fewer are the combinations of joints that muscles turn most. Default: J.
+        env (EnvBase): a body actuated only by muscles, after a reset.
+        num_synergies (int, optional): d, at most the number J of joints that muscles turn. With
+            fewer, each is a combination of the joints that muscles turn most. Default: J.
 
     Keyword Args:
-        rest (float): activation of coefficients 0, in (0, 1). Default: 0.25.
+        rest (float): activation at zero coefficients, in (0, 1). Default: 0.25.
 
     Raises:
         ValueError: if not all actuators are muscles, d is not in 1 to J, or ``rest`` is outside of
@@ -51,18 +51,18 @@ def body_synergies(
 
 
 def muscle_changes(torques: np.ndarray, num_synergies: int | None = None) -> np.ndarray:
-    """Changes of activation [d, n] that turn one joint each, or one combination of joints.
+    """Changes of activation [d, n] that each turn one joint, or one combination of joints.
 
-    Equation: the rows of the pseudo-inverse of M, the torques with rows of unit length, without
-    its singular values below a tenth of the largest, for d < J combined by its first d left
-    singular vectors.
+    Equation: the rows of pinv(M)ᵀ, where M is ``torques`` with rows of unit length, without
+    singular values below a tenth of the largest. For d < J, M's first d left singular vectors
+    combine these rows.
 
     Args:
-        torques (array): of each fully active muscle on each joint [J, n].
+        torques (array): torque of each fully active muscle on each joint [J, n].
         num_synergies (int, optional): d, at most J; with all J, synergy i turns joint i alone.
 
     Returns:
-        array: the largest change of each row is 1.
+        array: changes [d, n], whose largest magnitude in each row is 1.
 
     Raises:
         ValueError: if d is not in 1 to J.
@@ -89,7 +89,7 @@ def muscle_changes(torques: np.ndarray, num_synergies: int | None = None) -> np.
 
 
 def body_decoder(env: EnvBase, changes: np.ndarray, *, rest: float = 0.25) -> SynergyDecoder:
-    """Decodes coefficients into actions whose excitations leave ``rest`` by changes [d, n]."""
+    """A decoder into actions whose excitations differ from ``rest`` by ``changes`` [d, n]."""
     check_real("(0, 1)", rest=rest)
     bounds = env.full_action_spec_unbatched["action"].space
     center, slope = _action_of(env, rest, bounds.low, bounds.high)
@@ -98,11 +98,11 @@ def body_decoder(env: EnvBase, changes: np.ndarray, *, rest: float = 0.25) -> Sy
 
 
 def _action_of(env: EnvBase, rest: float, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """The action [n] whose excitation is ``rest``, and how fast excitation grows there [n]."""
+    """The action [n] whose excitation is ``rest``, and the slope of excitation there [n]."""
     low, high = low.clone().double(), high.clone().double()
     if not ((excitation(env, low) < rest) & (rest < excitation(env, high))).all():
         raise ValueError(f"rest is {rest}, and no action inside the bounds makes that.")
-    for _ in range(60):  # it is increasing: halve the interval
+    for _ in range(60):  # bisection: excitation is increasing
         middle = (low + high) / 2
         below = excitation(env, middle) < rest
         low, high = torch.where(below, middle, low), torch.where(below, high, middle)

@@ -1,4 +1,4 @@
-"""One way to build any task: simulator, small wrappers, one TorchRL environment."""
+"""Builds a task: simulator, small wrappers, one TorchRL environment."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from torchrl_etl.extras import extra
 __all__ = ["actuator_names", "make_env"]
 
 _LONGEST_SEARCH = 1000
-"""Steps of the episode in which a task's success is looked for."""
+"""Maximum number of steps in the search for a task's success key."""
 
 
 def make_env(
@@ -53,11 +53,10 @@ def make_env(
 ) -> EnvBase:
     """Builds a task as a TorchRL environment.
 
-    MyoSuite, DMControl and Gymnasium tasks take the same path. With several environments, their
-    simulators are stepped in turn below a single TorchRL environment of batch size ``[num_envs]``:
-    TorchRL's own work is then done once a batch. Use several collector workers for parallelism.
-    Simulators are imported here and not at the top of the module, so a worker process that
-    calls this function registers what it needs.
+    MyoSuite, DMControl and Gymnasium tasks are built alike. With several environments, their
+    simulators are stepped in turn below a single TorchRL environment of batch size ``[num_envs]``,
+    so TorchRL's overhead occurs once per batch. Use several collector workers for parallelism.
+    Simulators are imported inside this function, so worker processes register them on their own.
 
     Args:
         name (str): a task of :func:`~torchrl_etl.envs.list_tasks`, ``"overactuated"``, a registered
@@ -69,38 +68,36 @@ def make_env(
             Defaults to 1.
         goal (str, optional): ``"fixed"`` or ``"random"``, see
             :func:`~torchrl_etl.envs.resolve_task`.
-        seed (int, optional): seeds the environment, as ``env.set_seed(seed)`` does at any time
-            later. After ``env.set_seed(s); env.reset()``, a used environment and a fresh one give
-            bit-identical rollouts for the same actions. Each simulator of a batch gets
-            a seed of its own.
-        device (torch.device, optional): where the tensors go; simulation stays on the CPU.
-        activations (bool): adds ``activation``, the muscle activations in units of the
-            action (bodies with muscles alone). Defaults to ``False``.
-        muscle_lengths (bool): adds ``muscle_length``, the lengths of muscles with their tendons in
-            metres (the same). Defaults to ``False``.
-        action_repeat (int): simulator steps for which every action is taken; their rewards add up,
-            and an episode's time limit still counts simulator steps. Defaults to 1.
+        seed (int, optional): seeds the environment, as a later ``env.set_seed(seed)`` does. After
+            ``env.set_seed(s); env.reset()``, a used environment and a fresh one give bit-identical
+            rollouts for the same actions. Each simulator of a batch gets a different seed.
+        device (torch.device, optional): device of the tensors; simulation stays on the CPU.
+        activations (bool): adds ``activation``, the muscle activations in action units. Requires
+            a body actuated only by muscles. Defaults to ``False``.
+        muscle_lengths (bool): adds ``muscle_length``, the muscle-tendon lengths in metres.
+            Requires a body actuated only by muscles. Defaults to ``False``.
+        action_repeat (int): simulator steps per action. Their rewards are summed; time limits
+            still count simulator steps. Defaults to 1.
         success_key (str, optional): the entry of ``info`` that means success. Default: the
-            task's own, or else the first of ``solved``, ``is_success`` and ``success`` that an
-            episode of uniform actions (of 1,000 steps at most) shows.
+            task's own, or else the first of ``solved``, ``is_success`` and ``success`` found in
+            an episode of uniform actions (1,000 steps at most).
         env_kwargs (mapping, optional): passed to ``gymnasium.make``, or to
             ``dm_control.suite.load``.
 
     Keys:
         - ``observation`` [O], float32, flat. DMControl's parts are joined in alphabetical order.
-        - ``action`` [n], float32, flat, within the bounds that the simulator declares: [-1, 1] for
-          MyoSuite's hands and arm and for DMControl, [0, 1] for MyoSuite's legs.
+        - ``action`` [n], float32, flat, within the simulator's bounds: [-1, 1] for MyoSuite's
+          hands and arm and for DMControl, [0, 1] for MyoSuite's legs.
         - ``reward`` [1]; ``done``, ``terminated``, ``truncated`` [1]. Time limits truncate.
-        - ``solved`` [1], bool, where the task defines it: whether this very step meets the task's
-          criterion. ``False`` at reset.
-        - ``activation`` [n], ``muscle_length`` [n], float32, in the order of the action, if asked
-          for.
+        - ``solved`` [1], bool, where the task defines it: whether the current step meets the
+          task's criterion. ``False`` at reset.
+        - ``activation`` [n], ``muscle_length`` [n], float32, in action order, if requested.
 
     Raises:
         ValueError: for an unknown name, a goal that the task lacks, ``env_kwargs`` that it does not
-            take, or actions that are not continuous, not bounded, or cannot move. While it runs,
-            the environment raises
-            :class:`~torchrl_etl.envs.SimulationError` if a value is not finite.
+            take, or actions that are not continuous or not bounded, or whose bounds are equal. A
+            running environment raises :class:`~torchrl_etl.envs.SimulationError` if a value is
+            not finite.
 
     Examples:
         >>> from torchrl_etl.envs import make_env
@@ -140,17 +137,17 @@ def make_env(
 def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
     """Returns the names of a task's actuators, in the order of its action.
 
-    MyoSuite builds some hands with the suffix ``_r`` on every name, and others without. A suffix
-    that every name carries says nothing, so it is left out: the muscles of Hand Pose and of
-    Key Turn are then the same by name. Legs, which have both sides, keep theirs.
+    A suffix ``_r`` that every name has is removed, since MyoSuite uses it for some hands and not
+    for others. Hand Pose and Key Turn then have the same muscle names. Legs, which have both
+    sides, keep their suffixes.
 
     Args:
-        env (str or EnvBase or gymnasium.Env): a task's name, or an environment on one.
+        env (str or EnvBase or gymnasium.Env): a task's name or an environment.
 
     Returns:
-        list of str: one name for each entry of the action; ``actuator_0`` and so on where there is
-        no MuJoCo model to read them from. Of a model with more actuators than the action has
-        entries, the muscles are named if they are as many as the action, otherwise none.
+        list of str: one name for each entry of the action, or ``actuator_0`` and so on without a
+        MuJoCo model. If the model has more actuators than the action has entries, the names are
+        those of its muscles if their number fits, otherwise ``actuator_0`` and so on.
 
     Examples:
         >>> from torchrl_etl.envs import actuator_names
@@ -166,15 +163,15 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
             built.close()
     simulation = simulator(env)
     names = _raw_actuator_names(simulation)
-    suited = hasattr(simulation, "action_space")  # else dm_control's own, in no Gymnasium wrapper
+    suited = hasattr(simulation, "action_space")  # otherwise a bare dm_control environment
     space = simulation.action_space if suited else simulation.action_spec()
     count = math.prod(space.shape)
-    if len(names) > count:  # the simulator itself drives the rest: a prosthesis, for one
+    if len(names) > count:  # the simulator drives the rest itself, for example a prosthesis
         first = getattr(getattr(simulation, "model", None), "actuator_actadr", ())
         names = [name for name, at in zip(names, first, strict=False) if at >= 0]
     if len(names) != count:
         return [f"actuator_{i}" for i in range(count)]
-    if len(set(names)) < len(names):  # some models name no actuator, or two alike
+    if len(set(names)) < len(names):  # some models have unnamed actuators or duplicate names
         names = [f"{name or 'actuator'}_{i}" for i, name in enumerate(names)]
     if all(name.endswith("_r") for name in names):
         return [name.removesuffix("_r") for name in names]
@@ -182,10 +179,10 @@ def actuator_names(env: str | EnvBase | gym.Env) -> list[str]:
 
 
 class _BatchedGymWrapper(GymWrapper):
-    """``GymWrapper`` whose reset takes a tensordict without mask, and a mask on any device.
+    """``GymWrapper`` whose reset accepts a tensordict without a mask, and a mask on any device.
 
-    Such a tensordict carries what transforms need at a reset (a chosen direction, for one);
-    TorchRL 0.14 then looks for a mask in vain, and takes the one it finds to be on the CPU.
+    Such a tensordict carries entries for transforms at reset, such as a chosen direction. TorchRL
+    0.14 requires the mask to be there and on the CPU.
     """
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -233,7 +230,7 @@ def _build(
 
 
 def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
-    """Builds the environment, its action flat; also returns what it raises when it diverges."""
+    """Builds the environment with a flat action; also returns its errors for divergence."""
     if task.suite == "dm_control":
         suite = dm_control_suite()
         with extra("dm_control"):
@@ -246,10 +243,10 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
     else:
         if task.suite == "myosuite":
             register_myosuite()
-        # Gymnasium's checker compares every step with the spaces; TorchRL's specs and the guard do.
+        # TorchRL's specs and FiniteGuard replace Gymnasium's checks of every step.
         env, faults = gym.make(task.env_id, disable_env_checker=True, **env_kwargs), ()
     try:
-        if env_kwargs and task.suite != "dm_control":  # which refuses them itself
+        if env_kwargs and task.suite != "dm_control":  # dm_control rejects unknown ones itself
             check_known(env, task.name, env_kwargs)
         check_action_space(env.action_space, task.name)
     except ValueError:
@@ -259,10 +256,10 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
 
 
 def _success_key(task: Task, env_kwargs: Mapping[str, Any] | None) -> str | None:
-    """The task's own key, or the one seen in an episode of a simulator that is then thrown away.
+    """The task's own key, or the one found in an episode of a temporary simulator.
 
-    Some tasks tell of success in the last ``info`` only. Nothing of the search, its seed least of
-    all, must reach the simulators that are used.
+    Some tasks report success only in the last ``info``. The temporary simulator keeps the seed
+    and state of the search away from those in use.
     """
     if task.solved is not None:
         return "solved" if task.solved else None

@@ -1,4 +1,4 @@
-"""What the muscles of a body do to its joints, read from the MuJoCo model."""
+"""Joint torques of a body's muscles, computed from the MuJoCo model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["JointTorques", "active_torques", "excitation", "joint_torques"]
 
 
 class JointTorques(NamedTuple):
-    """Names of J joints, and the torque on each of a fully active muscle [J, n], in N·m (or N)."""
+    """Names of J joints, and the torque of each fully active muscle on them [J, n], N·m (or N)."""
 
     joints: tuple[str, ...]
     matrix: np.ndarray
@@ -23,27 +23,27 @@ class JointTorques(NamedTuple):
 def joint_torques(
     env: EnvBase, *, num_postures: int = 32, spread: float = 0.25, seed: int = 0
 ) -> JointTorques:
-    """Moment arms times peak forces: the torque that each muscle adds to each joint.
+    """Torque of each fully active muscle on each joint: moment arm times peak force.
 
-    It is the mean over the posture after a reset and others near it, at rest: every joint is moved
-    by up to half of ``spread`` times its range to either side. Active forces alone count, not those
-    of stretched muscles. A joint that an equality ties to another one (the sliding parts of a knee)
-    adds its torque to that one's, by the ratio in which the two move. Joints that no muscle spans
-    are left out.
+    Torques are averaged over the current posture and random postures near it, at zero velocity.
+    These move every joint by up to half of ``spread`` times its range to either side. Only active
+    forces count, not passive ones. If an equality couples a joint to another one (the sliding
+    parts of a knee), its torque is added to that joint's, scaled by the ratio of their motions.
+    Joints that no muscle spans are left out.
 
     Args:
-        env (EnvBase): an environment on a MuJoCo model all of whose actuators are muscles.
+        env (EnvBase): an environment with a MuJoCo model, actuated only by muscles.
 
     Keyword Args:
-        num_postures (int): postures in all. Default: 32.
-        spread (float): share of each joint's range in which they lie. Default: 0.25.
-        seed (int): of the postures. Default: 0.
+        num_postures (int): total number of postures. Default: 32.
+        spread (float): share of each joint's range that the postures cover. Default: 0.25.
+        seed (int): seed of the postures. Default: 0.
 
     Returns:
-        JointTorques: rows in the model's order of joints, columns in that of the action.
+        JointTorques: rows in the model's joint order, columns in action order.
 
     Raises:
-        ValueError: if there is no MuJoCo model, or one with other actuators than muscles.
+        ValueError: if there is no MuJoCo model, or if not all of its actuators are muscles.
 
     Examples:
         >>> from torchrl_etl.envs import joint_torques, make_env
@@ -52,7 +52,7 @@ def joint_torques(
         (23, 39)
     """
     model, now = muscle_state(env, "A torque on each joint per muscle, as of synergies=body,")
-    import mujoco  # there, since its model is
+    import mujoco  # installed, since the model exists
 
     data, generator = mujoco.MjData(model), np.random.default_rng(seed)
     simple = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
@@ -73,12 +73,12 @@ def joint_torques(
 
 
 def excitation(env: EnvBase, action: Tensor) -> Tensor:
-    """The excitations in [0, 1] of actions [*, n]: MyoSuite's sigmoid of them, or themselves.
+    """Excitations in [0, 1] of actions [*, n]: MyoSuite's sigmoid of them, or the actions.
 
-    Held, an excitation is what the activation of a muscle comes to.
+    Under a constant excitation, the activation of a muscle converges to it.
 
     Raises:
-        ValueError: if the environment does not say which of the two.
+        ValueError: if the environment does not tell which of the two applies.
 
     Examples:
         >>> import torch
@@ -86,7 +86,7 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
         >>> excitation(make_env("myoHandKeyTurn"), torch.tensor([-1.0, 0.5])).tolist()
         [0.0005..., 0.5]
     """
-    base = getattr(env, "base_env", env)  # under a SynergyAction actions are synergies
+    base = getattr(env, "base_env", env)  # with a SynergyAction, actions are synergies
     bounds = base.full_action_spec_unbatched["action"].space
     if sends_sigmoid(env, bounds.low, bounds.high):
         return (5.0 * (action - 0.5)).sigmoid()
@@ -94,7 +94,7 @@ def excitation(env: EnvBase, action: Tensor) -> Tensor:
 
 
 def active_torques(model: Any, data: Any, joints: np.ndarray) -> np.ndarray:
-    """Of each muscle alone on hinges or slides in one posture [J, n], less what is passive."""
+    """Active torque of each muscle on hinge or slide joints [J, n] in the current posture."""
     import mujoco
 
     torques = []
@@ -107,9 +107,9 @@ def active_torques(model: Any, data: Any, joints: np.ndarray) -> np.ndarray:
 
 
 def _tied(model: Any, data: Any) -> np.ndarray:
-    """How far each hinge or slide moves with each [J, J], as rows of those that are free.
+    """Motion of each hinge or slide (column) per motion of each free one (row) [J, J].
 
-    Brings the tied ones in ``data`` to where their equalities want them.
+    Moves the coupled joints of ``data`` to satisfy their equalities.
     """
     import mujoco
 

@@ -1,4 +1,4 @@
-"""What an environment must offer of its muscles, and how its actions excite them."""
+"""An environment's muscle state, and how its actions excite the muscles."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Array = Tensor | np.ndarray
 
 
 def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
-    """MuJoCo's model and data of a body of which each entry of the action moves a muscle.
+    """MuJoCo's model and data of a body whose actuators are all muscles, one per action entry.
 
     Raises:
-        ValueError: if it is another, with what asked for it.
+        ValueError: for any other environment; the message begins with ``asked_by``.
     """
     inner, found = simulator(env), "none"
     with suppress(ValueError):
         model, data = mujoco_state(inner)
-        import mujoco  # there, since its model is
+        import mujoco  # installed, since the model exists
 
         muscles = int((model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE).sum())
         size = math.prod(inner.action_space.shape)
@@ -41,10 +41,10 @@ def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
 
 
 def sends_sigmoid(env: EnvBase | gym.Env, low: Array, high: Array) -> bool:
-    """Whether actions in these bounds excite muscles by MyoSuite's sigmoid, or are excitations.
+    """Whether actions within these bounds pass MyoSuite's sigmoid; otherwise they are excitations.
 
     Raises:
-        ValueError: if neither is known to be so.
+        ValueError: if neither is known to hold.
     """
     inner = simulator(env)
     if (low >= 0).all():

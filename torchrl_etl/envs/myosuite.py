@@ -1,4 +1,4 @@
-"""MyoSuite's environments, and Hand Pose as MyoSuite 2 had it."""
+"""MyoSuite's environments, and Hand Pose with the hand of MyoSuite 2."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _HAND_POSE = {
 def register_myosuite() -> None:
     """Registers MyoSuite's environments, and Hand Pose with the hand of MyoSuite 2.
 
-    In MyoSuite 3 Hand Pose has another hand, whose fingers pass through each other and whose thumb
-    turns about its first two axes in another order. Key Turn and Pen Twirl kept the old one. Here
-    it takes postures again, with Key Turn's key taken away: on the fixed goal observations,
-    rewards and contacts are then those of MyoSuite 2.5 and 2.12. Targets are not drawn.
+    MyoSuite 3 changed the hand of Hand Pose: its fingers pass through each other, and the first
+    two axes of its thumb are swapped. Key Turn and Pen Twirl kept the old hand. Hand Pose here
+    uses Key Turn's hand without the key. With the fixed goal, observations, rewards and contacts
+    equal those of MyoSuite 2.5 and 2.12. Targets are not rendered.
     """
     with extra("myosuite"):
         import myosuite  # noqa: F401  (importing it registers its environments)
@@ -54,7 +54,7 @@ def _without_key(spec: Any) -> Any:
 
 
 def _old_order(joints: Any) -> list[Any]:
-    """The thumb's abduction before its flexion."""
+    """Puts the thumb's abduction before its flexion."""
     joints = list(joints)
     joints[3], joints[4] = joints[4], joints[3]
     return joints

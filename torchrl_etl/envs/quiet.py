@@ -1,4 +1,4 @@
-"""Silence for complaints of the simulators that a user can do nothing about, and for no others."""
+"""Suppresses simulator warnings that a user can do nothing about, and no others."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torchrl_etl.extras import extra
 __all__ = ["dm_control_suite", "quiet_compiler"]
 
 _HARMLESS = (
-    "Attaching a spec with an empty prefix",  # MyoSuite's hands: matters for saving the model
+    "Attaching a spec with an empty prefix",  # MyoSuite's hands: only affects saving the model
     "compiler attribute 'settotalmass' is deprecated",  # some of DMControl's models
 )
 
 
 @contextlib.contextmanager
 def quiet_compiler() -> Iterator[None]:
-    """While models are built, keeps MuJoCo's known complaints to itself.
+    """Suppresses known warnings of MuJoCo's compiler while models are built.
 
-    MuJoCo otherwise writes its compiler's warnings to stderr and to a file in the working
-    directory. Unknown ones become Python warnings.
+    MuJoCo would write them to stderr and to a file in the working directory. Other warnings
+    become Python warnings.
     """
     try:
         import mujoco
@@ -46,7 +46,7 @@ def quiet_compiler() -> Iterator[None]:
 
 
 def dm_control_suite() -> ModuleType:
-    """Imports DMControl's suite, without its complaint that a machine has no screen."""
+    """Imports DMControl's suite without its warning about a missing display."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing")
         with extra("dm_control"):

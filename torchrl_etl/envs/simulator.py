@@ -13,7 +13,7 @@ __all__ = ["mujoco_state", "simulator"]
 
 
 def simulator(env: EnvBase | gym.Env | gym.vector.VectorEnv) -> Any:
-    """The (first) simulator under transforms, wrappers and vectorisation.
+    """The (first) simulator under transforms, wrappers and vectorized environments.
 
     Examples:
         >>> from torchrl_etl.envs import make_env
@@ -49,7 +49,7 @@ def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
     if hasattr(inner, "physics"):  # DMControl
         return inner.physics.model.ptr, inner.physics.data.ptr
     model, data = getattr(inner, "model", None), getattr(inner, "data", None)
-    mujoco = sys.modules.get("mujoco")  # whatever runs on it has imported it
+    mujoco = sys.modules.get("mujoco")  # imported by every environment that runs on it
     if mujoco and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         return model, data
     name = type(inner).__name__

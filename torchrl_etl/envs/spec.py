@@ -1,4 +1,4 @@
-"""What a learner must know of an environment: sizes, bounds, names."""
+"""Sizes, bounds and actuator names of an environment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["EnvironmentSpec"]
 
 
 class EnvironmentSpec(NamedTuple):
-    """Read once from an environment and handed on in its place.
+    """Everything that a learner needs to know of an environment, read once.
 
     Attributes:
         observation_dim (int): O.

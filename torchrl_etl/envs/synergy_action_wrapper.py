@@ -1,4 +1,4 @@
-"""A synergy bundle around a Gymnasium environment, for whoever does not use TorchRL."""
+"""Synergy actions for Gymnasium environments, without TorchRL's collectors and losses."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ __all__ = ["SynergyActionWrapper"]
 
 
 class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
-    """Lets an agent act through a synergy decoder.
+    """Executes the decoded action of a synergy decoder at each step.
 
-    What :class:`~torchrl_etl.transforms.SynergyAction` is to a TorchRL environment: the action
-    space is the decoder's box, and each step executes what it decodes to.
+    The Gymnasium counterpart of :class:`~torchrl_etl.transforms.SynergyAction`. The action space
+    becomes the decoder's synergy space.
 
     Equation: a = Dec(z^a) of section 4.2.
 
     Args:
-        env (gymnasium.Env): with a flat box of actions.
-        bundle (path-like or SynergyMap): a bundle's folder or a run folder, whose muscles must be
-            the environment's by name; or a decoder, which must be of as many and within the same
-            bounds.
+        env (gymnasium.Env): an environment with a flat ``Box`` action space.
+        bundle (path-like or SynergyMap): a bundle's folder, a run folder, or a decoder. A bundle's
+            muscles must match the environment's by name; a decoder must match in number of
+            actuators and bounds.
 
     Keyword Args:
-        residual (float, optional): replaces the residual share of a bundle; 0 leaves d numbers to
-            the agent.
+        residual (float, optional): replaces the residual share of a bundle. With 0 the action has
+            d entries.
 
     Raises:
         TypeError: if ``bundle`` is neither.
-        BundleError: if there is no bundle, or it is of other muscles or bounds.
-        ValueError: if the actions are no flat box of real numbers, or do not fit the decoder.
+        BundleError: if there is no bundle, or its muscles or bounds do not match.
+        ValueError: if the action space is no flat float ``Box``, or does not fit the decoder.
 
     Examples:
         >>> import gymnasium
@@ -88,11 +88,11 @@ class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
 
     @torch.no_grad()
     def action(self, action: np.ndarray) -> np.ndarray:
-        """The muscles' action [n] of coefficients [d], or [d + n] with a residual."""
+        """The muscle action [n] for coefficients [d], or [d + n] with a residual."""
         synergy = torch.as_tensor(action, dtype=self.decoder.low.dtype)
         check_width(self.action_space.shape[0], action=synergy)
         decoded = self.decoder.module(synergy.to(self.decoder.low.device))
-        box = self.env.action_space  # whose bounds single precision may round outwards
+        box = self.env.action_space  # float32 may round the action beyond its bounds
         return decoded.cpu().numpy().astype(box.dtype).clip(box.low, box.high)
 
 

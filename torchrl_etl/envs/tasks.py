@@ -1,7 +1,6 @@
 """Task names: the paper's thirteen tasks, and what else :func:`make_env` accepts.
 
-Building nothing and importing no simulator for the thirteen, so that a name can be checked
-before workers start.
+The thirteen need no simulator here, so names can be checked before workers start.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ Goal = Literal["fixed", "random"]
 
 @dataclass(frozen=True)
 class Task:
-    """One task: how to build it, and what its episodes are.
+    """One task: how to build it, and how its episodes end and count as solved.
 
     Attributes:
-        name: Short name, e.g. ``"myoHandPose"``; the environment id where there is none.
-        id: Environment id that is built for ``goal="fixed"``.
-        random_id: Environment id that is built for ``goal="random"``, if the task has one.
+        name: Short name, e.g. ``"myoHandPose"``; the environment id if there is none.
+        id: Environment id for ``goal="fixed"``.
+        random_id: Environment id for ``goal="random"``, if the task has one.
         suite: ``"myosuite"``, ``"dm_control"`` or ``"gymnasium"``.
-        episode_steps: Number of steps after which an episode is truncated, ``None`` if it never is
-            (or, for DMControl domains outside the paper, not known before the task is built).
-        solved: Whether the task says when it is solved; ``None`` means that :func:`make_env`
+        episode_steps: Number of steps after which an episode is truncated. ``None`` without a
+            limit and, for DMControl domains outside the paper, before the task is built.
+        solved: Whether the task reports success; ``None`` means that :func:`make_env`
             finds out in an episode of uniform actions.
-        solved_steps: On how many steps an episode must be solved to count as solved;
-            ``None`` means on its last.
-        goal: Which of the two goals is meant; ``None`` where an id says neither.
-        ends_early: Whether an episode can end before its time; if not, the simulation goes on.
+        solved_steps: Number of solved steps for an episode to count as solved; ``None`` means
+            that its last step must be solved.
+        goal: Which of the two goals is meant; ``None`` if an id does not tell.
+        ends_early: Whether episodes can terminate; otherwise the simulation continues to the limit.
 
     Examples:
         >>> from torchrl_etl.envs import resolve_task
@@ -64,7 +63,7 @@ class Task:
 
     @property
     def goal_in_words(self) -> str:
-        """``" (fixed goal)"`` and so on, for messages; empty where neither goal is meant."""
+        """``" (fixed goal)"`` and so on, for messages; empty without a goal."""
         return f" ({self.goal} goal)" if self.goal else ""
 
     @property
@@ -76,10 +75,10 @@ class Task:
 
 
 _MYOSUITE_STEPS = 6
-"""MyoSuite's ``evaluate_success`` asks for more than five solved steps."""
+"""MyoSuite's ``evaluate_success`` requires more than five solved steps."""
 
 _SOLVED_ONCE = re.compile(r"myo\w*Challenge(ChaseTag|Soccer|TableTennis|OslRun)")
-"""MyoChallenge's tasks that end with their success, which its ``get_metrics`` counts."""
+"""MyoChallenge tasks that end on success, as counted by its ``get_metrics``."""
 
 
 def _hand(name: str, steps: int) -> Task:
@@ -114,15 +113,15 @@ _PAPER = (
 _IDS = "torchrl_etl/Overactuated-v0", "torchrl_etl/OveractuatedRandom-v0"
 _ANALYTIC = Task("overactuated", *_IDS, "gymnasium", 25, True, 6)
 
-# Their rewards are negative and a drop ends them, so that dropping early can pay. Where it ends
-# nothing, it does not.
+# These tasks have negative rewards and end on a drop, so dropping early can pay. The variants
+# continue after a drop.
 _FULL = tuple(
     replace(task, name=f"{task.name}Full", ends_early=False)
     for task in _PAPER
     if task.name in ("myoBaoding", "myoDieReorient", "myoRelocate")
 )
 
-# The Hand Pose that others have published results of; MyoSuite 3's is another task.
+# The Hand Pose of published results; MyoSuite 3's is a different task.
 _MYO2 = replace(_hand("torchrl_etl/Myo2HandPose", 100), name="myo2HandPose")
 
 _BY_NAME = {task.name: task for task in (*_PAPER, *_FULL, _MYO2, _ANALYTIC)}
@@ -138,7 +137,7 @@ _DM_CONTROL_NAME = re.compile(r"(\w+)-(?!v\d+$)(\w+)")
 
 
 def list_tasks() -> tuple[Task, ...]:
-    """Returns the paper's thirteen tasks, in the paper's groups: hand, leg, DMControl.
+    """Returns the paper's thirteen tasks, grouped as in the paper: hand, leg, DMControl.
 
     Examples:
         >>> from torchrl_etl.envs import list_tasks
@@ -156,13 +155,13 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
     Args:
         name (str): a short name of :func:`list_tasks`, ``"myo2HandPose"`` or ``"overactuated"``;
             any environment id registered with Gymnasium (MyoSuite's are registered on demand;
-            ``"module:id"`` imports ``module`` first, from the current folder too); or any
+            ``"module:id"`` imports ``module`` first, also from the current folder); or any
             DMControl ``"domain-task"``, e.g. ``"cheetah-run"``.
-        goal (str, optional): ``"fixed"`` or ``"random"``. ``None`` (default) is the fixed goal for
-            a short name, and for an id what ``Fixed`` or ``Random`` in it says.
+        goal (str, optional): ``"fixed"`` or ``"random"``. Default: the fixed goal for a short
+            name; for an id, the goal given by ``Fixed`` or ``Random`` in it.
 
     Returns:
-        Task: the task, with ``goal`` filled in where it is known.
+        Task: the task, with ``goal`` filled in if it is known.
 
     Raises:
         ValueError: for an unknown name (with the nearest known ones), or a goal that the task does
@@ -243,10 +242,10 @@ def _in_dm_control(name: str) -> bool:
 
 
 def _registered(name: str) -> bool:
-    """Whether Gymnasium knows the id, after the import of what registers it in ``"module:id"``."""
+    """Whether Gymnasium knows the id, after importing the module of ``"module:id"``."""
     module, _, env_id = name.rpartition(":")
     if module:
-        # Gymnasium 1 loads no plugins: nothing else runs a user's gymnasium.register.
+        # Gymnasium 1 loads no plugins, so nothing else runs a user's gymnasium.register.
         import_own(module, f"the task {name!r}; a task of your own is 'module:id'")
         if env_id not in gym.registry:
             raise ValueError(
@@ -259,7 +258,7 @@ def _registered(name: str) -> bool:
 
 
 def _by_its_spec(name: str, goal: Goal | None) -> Task:
-    """A task of which only what Gymnasium's registry and the id say is known."""
+    """A task known only from its id and Gymnasium's registry."""
     env_id = name.rpartition(":")[2]
     spec = gym.spec(env_id)
     said = next((own for own in ("fixed", "random") if own.capitalize() in env_id), None)

@@ -1,8 +1,8 @@
 """Small Gymnasium wrappers between a simulator and TorchRL's ``GymWrapper``.
 
-What TorchRL should see goes through the *observation*, not through ``info``: a dict observation is
+All entries for TorchRL go through a dict observation, not through ``info``. Unlike ``info``, it is
 declared in the specs, survives partial resets, and is batched by Gymnasium's vector environments
-without any per-key work, while ``info`` has none of these.
+without per-key work.
 """
 
 from __future__ import annotations
@@ -35,15 +35,14 @@ SUCCESS_KEYS = ("solved", "is_success", "success")
 
 
 class SimulationError(RuntimeError):
-    """A simulation left the real numbers: an observation, a reward or an action is not finite; or
-    its observation does not fit the space that it declares."""
+    """A simulation diverged, a value is not finite, or an observation does not fit its space."""
 
 
 class FlatObservation(gym.ObservationWrapper):
-    """Joins the boxes of a dict observation, in the order of its space.
+    """Concatenates the boxes of a dict observation, in the order of its space.
 
-    Gymnasium's ``FlattenObservation`` does the same for any space; the generality costs a
-    simulated dog 50 µs a step, a twentieth of its physics.
+    Gymnasium's ``FlattenObservation`` does the same for any space, but takes 50 µs per step of
+    DMControl's dog, a twentieth of its physics.
     """
 
     def __init__(self, env: gym.Env):
@@ -56,10 +55,10 @@ class FlatObservation(gym.ObservationWrapper):
 
 
 class FullEpisodes(gym.Wrapper):
-    """Goes on where an episode would end early, until its time limit truncates it.
+    """Ignores termination, so that only the time limit ends an episode.
 
-    Where rewards are negative, an early end is worth having; a simulation that goes on takes that
-    worth away, and invents no reward in its place.
+    With negative rewards, ending an episode early pays. Continuing the simulation removes this
+    incentive without adding a reward.
     """
 
     def step(self, action: np.ndarray):
@@ -68,10 +67,10 @@ class FullEpisodes(gym.Wrapper):
 
 
 class RepeatedAction(gym.Wrapper):
-    """Takes every action for several steps, or until the episode ends, and adds up their rewards.
+    """Repeats every action for several steps, or until the episode ends, and sums the rewards.
 
-    Observation, ``info`` and ends are those of the last of these steps. ``frame_skip`` of TorchRL's
-    ``GymWrapper`` does the same for one simulator, but stops a whole batch where one of it ends.
+    Observation, end flags and ``info`` are from the last of these steps. ``frame_skip`` of
+    TorchRL's ``GymWrapper`` would stop a whole batch when one of its simulators ends.
     """
 
     def __init__(self, env: gym.Env, steps: int):
@@ -89,10 +88,10 @@ class RepeatedAction(gym.Wrapper):
 
 
 class FiniteGuard(gym.Wrapper):
-    """Speaks float32, and stops at the first action, observation or reward that is not finite.
+    """Converts to float32, and raises on the first non-finite action, observation or reward.
 
-    A :class:`SimulationError` says which entries, in which episode and at which step; so it does of
-    ``faults``, by which the simulator itself reports that it diverged.
+    The :class:`SimulationError` gives the entries, the episode and the step. It also replaces
+    ``faults``, the exceptions by which a simulator itself reports divergence.
     """
 
     def __init__(self, env: gym.Env, name: str, faults: tuple[type[Exception], ...] = ()):
@@ -131,8 +130,8 @@ class FiniteGuard(gym.Wrapper):
         return observation, reward, *ends_and_info
 
     def _check(self, what: str, value: Any, cure: str | None = None) -> None:
-        # The squared norm is finite unless an entry is not (or is beyond 1e19): one fast product
-        # decides for nearly every step.
+        # A finite squared norm proves that all entries are finite: one fast product nearly always
+        # suffices. It also overflows for entries beyond 1e19.
         if not math.isfinite(np.vdot(value, value)):
             self._report(what, value, cure)
 
@@ -156,29 +155,28 @@ class FiniteGuard(gym.Wrapper):
 
 
 class NamedObservation(gym.Wrapper):
-    """Names the parts of an observation: ``observation``, ``solved``, and what muscles tell.
+    """A dict observation of ``observation`` and, on request, ``solved`` and the muscle state.
 
-    ``info`` is dropped: MyoSuite's nested dicts are slow to batch, and nothing downstream reads it.
+    Drops ``info``: MyoSuite's nested dicts are slow to batch, and nothing downstream reads them.
 
     Args:
         env (gym.Env): an environment with an array as observation.
         success_key (str, optional): the entry of ``info`` that becomes ``solved``, a boolean of
             shape [1] that is ``False`` at reset. ``None`` means that there is no such entry.
-        activations (bool): whether to add ``activation``, the muscle activations in the units of
-            the action, shape [n] (bodies with muscles alone).
-        muscle_lengths (bool): whether to add ``muscle_length``, MuJoCo's ``actuator_length`` in the
-            order of the action, shape [n] (the same). That is the length of muscle and
-            tendon together, in metres.
+        activations (bool): whether to add ``activation``, the muscle activations in action units,
+            shape [n]. Requires a body actuated only by muscles.
+        muscle_lengths (bool): whether to add ``muscle_length``, MuJoCo's ``actuator_length`` in
+            action order, shape [n]: muscle-tendon lengths in metres. Requires a body actuated
+            only by muscles.
 
     Equation:
         MyoSuite's hand and arm tasks excite a muscle by :math:`u = \\sigma(5(a - 1/2))`, so an
-        activation :math:`x` is worth the action :math:`a = 1/2 + \\ln(x / (1 - x)) / 5`, clipped to
-        the action's bounds. Its leg tasks take excitations as actions, so there
-        :math:`a = x`.
+        activation :math:`x` corresponds to the action :math:`a = 1/2 + \\ln(x / (1 - x)) / 5`,
+        clipped to the action's bounds. In leg tasks, actions are excitations, so :math:`a = x`.
 
     Raises:
-        ValueError: when ``activations`` or ``muscle_lengths`` is asked of an environment that does
-            not offer them, see :mod:`~torchrl_etl.envs.muscles`.
+        ValueError: if ``activations`` or ``muscle_lengths`` is requested and the environment does
+            not provide them, see :mod:`~torchrl_etl.envs.muscles`.
     """
 
     def __init__(
@@ -217,7 +215,7 @@ class NamedObservation(gym.Wrapper):
         return self._name_parts(observation, solved), reward, terminated, truncated, {}
 
     def _seek(self, info: Mapping[str, Any], ended: bool) -> None:
-        """Say so if no step of the first episode has the key."""
+        """Warn if no step of the first episode has the key."""
         missing = self._success_key not in info
         self._sought = missing and not ended
         if missing and ended:
@@ -243,7 +241,7 @@ class NamedObservation(gym.Wrapper):
         simulation = self.unwrapped
         activation = simulation.data.act[simulation.model.actuator_actadr]
         if self._sigmoid:
-            # Muscles rest at exactly zero after a reset: minus infinity, then the lower bound.
+            # Activation is exactly zero after a reset: log gives -inf, clipped to the lower bound.
             with np.errstate(divide="ignore"):
                 activation = 0.5 + np.log(activation / (1.0 - activation)) / 5.0
         bounds = self.action_space
@@ -251,19 +249,19 @@ class NamedObservation(gym.Wrapper):
 
 
 class SeededVectorEnv(SyncVectorEnv):
-    """Steps copies of an environment in turn; one seed gives each copy its own.
+    """Steps copies of an environment in turn, with independent seeds derived from one.
 
-    The first copy gets the seed itself, so it repeats what a single environment does. The others
-    get statistically independent ones: Gymnasium's ``seed + i`` would make the copies of one worker
-    repeat those of another whose seed is a little larger.
+    The first copy gets the seed itself and reproduces a single environment. The others get
+    statistically independent seeds. With Gymnasium's ``seed + i``, copies in workers whose seeds
+    are close would repeat each other.
     """
 
     def __init__(self, env_fns):
-        # TorchRL resets what is done, itself.
+        # TorchRL itself resets environments that are done.
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
 
     def step(self, actions: np.ndarray):
-        # As in the base class, less what its generality costs: batches of named parts only.
+        # The base class's step, specialized to dict observations for speed.
         for i, env in enumerate(self.envs):
             parts, self._rewards[i], self._terminations[i], self._truncations[i], _ = env.step(
                 actions[i]
