@@ -1,7 +1,7 @@
 """Explore to Learn (ETL) as TorchRL components: synergies for overactuated control.
 
-What is asked for most is here by name, such as ``from torchrl_etl import SynergyAction``; it is
-imported when it is asked for, since TorchRL takes seconds.
+The most used names can be imported from here, as in ``from torchrl_etl import SynergyAction``.
+They are loaded lazily, since importing TorchRL takes seconds.
 """
 
 from importlib import import_module

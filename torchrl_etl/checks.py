@@ -1,7 +1,7 @@
-"""Checks of arguments: what came, what is expected, and where one can see it, how to mend it.
+"""Checks of arguments. Messages give the value, what is expected and, if known, a fix.
 
-Every message begins with the argument's name, so that whoever builds a thing from a section of a
-configuration can put the section's name before it.
+Every message begins with the argument's name, so that :func:`naming` can prefix the section of a
+configuration.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Raise a ``ValueError`` that lists the choices and names the nearest.
+    """Raise a ``ValueError`` that lists the choices and the nearest one.
 
     Examples:
         >>> check_choice("stage", "learn", ("explore", "learn", "all"))
@@ -44,7 +44,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
 
 
 def check_integer(least: int, **values: object) -> None:
-    """Raise a ``ValueError`` naming the first value that is not an integer of ``least`` or more.
+    """Raise a ``ValueError`` naming the first value that is not an integer >= ``least``.
 
     Examples:
         >>> check_integer(2, batch_size=1)
@@ -105,7 +105,7 @@ def check_sizes(**values: object) -> None:
 
 
 def check_width(size: int, **tensors: Tensor) -> None:
-    """Raise a ``ValueError`` naming the first tensor with another last size; 1 would be broadcast.
+    """Raise a ``ValueError`` naming the first tensor whose last size is not ``size``.
 
     Examples:
         >>> import torch
@@ -122,18 +122,18 @@ def check_width(size: int, **tensors: Tensor) -> None:
 
 
 class _NamedInFull(ValueError):
-    """Says the full key already."""
+    """An error whose message has the full key already."""
 
 
 @contextmanager
 def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
-    """Put the section of a configuration before what a check of an argument says.
+    """Prefix the errors of argument checks with a section of the configuration.
 
     Args:
-        section (str): its name, or the part of it that a caller's ``naming`` does not say.
+        section (str): its name. Nested calls of ``naming`` prepend theirs.
 
     Keyword Args:
-        in_full (bool): nothing is to go before it. Default: ``False``.
+        in_full (bool): whether outer calls prepend nothing. Default: ``False``.
 
     Examples:
         >>> with naming("learn.sac"):
@@ -153,7 +153,7 @@ def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
 
 @contextmanager
 def renaming(**names: str) -> Iterator[None]:
-    """Let a check call an argument by the name that whoever passes it on has for it.
+    """Replace argument names in the errors of checks by the names that the caller uses.
 
     Examples:
         >>> with renaming(share="relabel"):
@@ -188,7 +188,7 @@ def _is_integer(value: object) -> bool:
 
 
 def not_finite(state: Mapping[str, Tensor]) -> str | None:
-    """The first entry that holds NaN or infinity, if any.
+    """The key of the first entry with a NaN or an infinity, if any.
 
     Examples:
         >>> import torch

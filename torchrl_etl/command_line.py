@@ -1,4 +1,4 @@
-"""What the recipes share: a typo gets the nearest right word, a fault one sentence."""
+"""Command-line code of the recipes: nearest matches for typos, one sentence for errors."""
 
 from __future__ import annotations
 
@@ -41,22 +41,21 @@ __all__ = [
 ]
 
 OPENING_FAULTS = (ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error)
-"""What explains itself when a run, a bundle or an entry is opened with its simulators."""
+"""Errors with a clear message when a run, a bundle or a zoo entry is opened."""
 
 
 def check_overrides(
     config: Path, arguments: list[str], usage: str, *, short: Sequence[str] = ()
 ) -> None:
-    """Answer ``--help``, and leave with the nearest key if an override names none that exists.
+    """Print help for ``--help``; exit with the nearest key if an override names an unknown one.
 
-    Hydra does both, but its help drops the comments of the YAML file, and it suggests nothing. What
-    exists depends on the files that are chosen: each kind has options of its own. A plus in front
-    of a key is no way around: nothing would read what it adds, but in the sections that are handed
-    on to another library.
+    Hydra's help drops the comments of the YAML file, and its errors suggest nothing. The known keys
+    depend on the chosen group files, since each kind has its own options. A leading plus does not
+    bypass the check, except in sections passed to another library: nothing would read the new key.
 
-    ``config`` is the primary YAML file, beside which folders are groups, and ``usage`` what the
-    help begins with; ``short`` are ways to write a setting that the recipe has translated already,
-    to be suggested like the rest.
+    ``config`` is the primary YAML file, with the folders of groups beside it. ``usage`` begins the
+    help text. ``short`` lists short keys, already translated by the recipe, that are suggested
+    like all others.
     """
     text = config.read_text(encoding="utf-8")
     defaults = OmegaConf.create(text).get("defaults", [])
@@ -98,16 +97,16 @@ def check_overrides(
 
 
 def translate(arguments: Sequence[str], groups: Path) -> list[str]:
-    """Short and former ways to write a setting, as Hydra reads them.
+    """Translates short and former settings to Hydra's overrides.
 
-    ``synergies=PATH`` is ``synergies.bundle=PATH`` unless it names a kind, ``KIND`` of
-    ``synergies.kind=KIND``, ``exploration.kind=KIND`` and ``method.kind=KIND`` brings that kind's
-    other settings unless it is a class of one's own, ``module:Class``, and the presets that hold
-    today's defaults are no preset: they are left out, as ``null`` is, which Hydra does not take for
-    a group. ``groups`` is the folder of the configuration's groups.
+    ``synergies=PATH`` becomes ``synergies.bundle=PATH`` unless it names a kind. For ``synergies``,
+    ``exploration`` and ``method``, ``GROUP.kind=KIND`` becomes ``GROUP=KIND`` and so selects that
+    kind's settings, unless KIND is a user's class, ``module:Class``. Presets equal to the current
+    defaults are removed. So is ``null``, which Hydra does not accept for a group. ``groups`` is
+    the folder of the configuration's groups.
 
     Raises:
-        ValueError: for a setting that has another name now, which it tells.
+        ValueError: for a renamed setting, with its new name.
 
     Examples:
         >>> groups = Path("recipes/conf")
@@ -136,15 +135,15 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
 
 
 def _former(name: str) -> str | None:
-    """The former name of a setting or a section that this one is, or is below."""
+    """The renamed setting or section that ``name`` is or belongs to, if any."""
     below = [old for old in RENAMED if f"{name}.".startswith(f"{old}.")]
     return max(below, key=len, default=None)
 
 
 def quote_paths(arguments: list[str], *keys: str) -> list[str]:
-    """Quote the values of path settings, in which Hydra's grammar allows no bracket or space.
+    """Quote the values of path settings, since Hydra's grammar allows no brackets or spaces.
 
-    A ``~`` is the home folder, as in the arguments that the shell expands. A list stays as it is.
+    Expands ``~`` to the home folder. Lists remain unchanged.
 
     Examples:
         >>> quote_paths(["run_dir=/my (new) runs/a", "seed=1"], "run_dir")
@@ -166,7 +165,7 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
 
 @contextmanager
 def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
-    """Turn faults of these kinds, which explain themselves, into one line and exit code 2."""
+    """Print an error of these kinds as one line and exit with code 2."""
     try:
         yield
     except kinds as error:
@@ -175,7 +174,7 @@ def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
 
 
 def print_intervals(summary: Mapping[str, Any]) -> None:
-    """Print return and solved, as :meth:`~torchrl_etl.training.Evaluation.summary` has them."""
+    """Print the return and success of an :meth:`~torchrl_etl.training.Evaluation.summary`."""
     for key in ("return", "solved", "solved_time"):
         if key in summary:
             mean, *ends = summary[key].values()
@@ -184,12 +183,12 @@ def print_intervals(summary: Mapping[str, Any]) -> None:
 
 
 def interval_in_words(low: float, high: float, digits: int) -> str:
-    """The ends of a 95 % interval; nothing for one episode alone, which has none."""
+    """The bounds of a 95 % interval; empty for a single episode, which has none."""
     return "" if math.isnan(low) else f"95% interval {low:.{digits}f} to {high:.{digits}f}"
 
 
 def quiet_torchrl() -> None:
-    """Keep out of the progress bar what libraries tell their developers; a warning is one line."""
+    """Keep libraries' developer messages out of the progress bar; print warnings in one line."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.simplefilter("ignore", FutureWarning)
     warnings.formatwarning = lambda message, *place, **source: f"Warning: {message}\n"
@@ -205,7 +204,7 @@ def _check_file(conf: Path, group: str, choice: str) -> None:
 
 
 def _composed(config: Path, chosen: list[str]) -> tuple[DictConfig, Mapping[str, str]]:
-    """All settings there are with these files of groups, and the file of each group."""
+    """All settings with the chosen group files, and the choice of each group."""
     with initialize_config_dir(str(config.parent.resolve()), version_base="1.3"):
         settings = compose(config.stem, chosen, return_hydra_config=True)
     OmegaConf.set_struct(settings, False)
@@ -213,15 +212,15 @@ def _composed(config: Path, chosen: list[str]) -> tuple[DictConfig, Mapping[str,
 
 
 def _print(*parts: str) -> None:
-    """Print with blank lines between, also to a pipe that is closed before the end, as of head."""
+    """Print parts separated by blank lines; allows a pipe that closes early, such as ``head``."""
     try:
         print(*parts, sep="\n\n", flush=True)
-    except BrokenPipeError:  # what is left would be tried again at the exit
+    except BrokenPipeError:  # the interpreter would flush again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _of_groups(conf: Path, groups: list[str], choices: Mapping[str, str]) -> Iterator[str]:
-    """The settings of the files that were chosen, each as the section that it fills."""
+    """The settings of the chosen group files, as sections of the configuration."""
     for group in groups:
         if (file := group_files(conf, group).get(choices.get(group))) is not None:
             inner = textwrap.indent(file.read_text(encoding="utf-8").rstrip(), "  ")

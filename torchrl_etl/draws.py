@@ -1,7 +1,7 @@
 """Random numbers of losses, which can be drawn beforehand.
 
-A loss takes its random numbers from here, so that those of many updates are drawn in one go, and
-several learners that are updated as one are each given what its own generator draws.
+Losses draw from this module. The numbers of many updates can thus be drawn at once, and learners
+that are updated together each get numbers from their own generator.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ __all__ = [
 ]
 
 Draw = Callable[..., Tensor]
-"""Draws one of a kind, or with sizes as arguments an array of so many."""
+"""Draws one tensor; sizes as arguments add leading batch dimensions."""
 
 
 class _Source(local):
-    """Where a thread's next numbers come from: a list of what is given, or the generator."""
+    """Source of a thread's next numbers: a list of given tensors, or the generator."""
 
     given: list[Tensor] | None = None
     recorded: list[Draw] | None = None
@@ -39,26 +39,26 @@ _source = _Source()
 
 
 def standard_normal(like: Tensor) -> Tensor:
-    """Independent N(0, 1) numbers of the shape of ``like``."""
+    """Independent N(0, 1) samples in the shape of ``like``."""
     return _next(partial(_of_shape, torch.randn, like))
 
 
 def standard_uniform(like: Tensor) -> Tensor:
-    """Independent U(0, 1) numbers of the shape of ``like``."""
+    """Independent U(0, 1) samples in the shape of ``like``."""
     return _next(partial(_of_shape, torch.rand, like))
 
 
 def uniform_order(count: int, device: torch.device) -> Tensor:
-    """A permutation of ``range(count)``, each as likely as any other."""
+    """A uniformly random permutation of ``range(count)``."""
     return _next(lambda *sizes: torch.rand(*sizes, count, device=device).argsort(-1))
 
 
 @contextmanager
 def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
-    """What is drawn within is taken from ``tensors``, one after another.
+    """Within the context, draws return ``tensors`` in order.
 
     Raises:
-        IndexError: where more is drawn than was given.
+        IndexError: if more tensors are drawn than given.
 
     Examples:
         >>> with given_draws([torch.ones(2)]):
@@ -73,10 +73,10 @@ def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
 
 
 def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:
-    """Draws what ``function`` would in so many calls, from the generators as they are.
+    """A function that draws the random numbers of several calls of ``function`` at once.
 
-    What that is, which must be the same for all arguments of a shape, is found out by the first
-    call with it, which runs ``function``.
+    Which numbers ``function`` draws may depend only on the shapes of its arguments. The first call
+    with new shapes runs ``function`` to record its draws, without advancing the generators.
 
     Examples:
         >>> draw = redrawn(lambda x: x + standard_normal(x))

@@ -1,4 +1,4 @@
-"""A whole run: what its method does first, then learning the task, then a report."""
+"""A whole run: the method's preparation, learning the task, and a summary."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class Experiment:
         config (DictConfig): see ``recipes/conf/config.yaml``.
 
     Keyword Args:
-        resume (path, optional): the run folder to go on in.
-        unique (bool): let the run folder get a number if another run was quicker to take its name.
+        resume (path, optional): the run folder to resume.
+        unique (bool): whether to number the run folder if another run has taken its name.
             Default: ``False``.
-        say (callable): where messages for a person go, one line each. Default: nowhere.
+        say (callable): receives messages for the user, one line each. Default: no messages.
 
     Raises:
-        ValueError: if the configuration is not one that can run.
+        ValueError: if the configuration is invalid.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Experiment:
         path = Path(resume or config.run_dir).expanduser()
         self.folder = RunFolder(path, self.config, unique=unique)
         self.context = Context(self.config, self.folder, say)
-        if resume is not None:  # a run of before may say what its method did not heed
+        if resume is not None:  # older runs may hold settings that their method overrode
             for key, value, _ in method.fixed:
                 OmegaConf.update(self.config, key, value)
         self.method = method(self.context)
@@ -81,16 +81,16 @@ class Experiment:
         self.resume = resume is not None
 
     def run(self) -> dict[str, Any]:
-        """Run the stages that the configuration asks for; returns what ``summary.json`` holds."""
+        """Run the configured stages; returns the content of ``summary.json``, without versions."""
         with StopOnSignal() as stop:
             return alone(self.work(stop))
 
     def work(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
-        """The same as work that pauses at each update, see
+        """:meth:`run` as a generator that pauses at each update, see
         :func:`~torchrl_etl.training.together`.
 
         Args:
-            stop (StopOnSignal): asked after every batch.
+            stop (StopOnSignal): checked after every batch.
         """
         self.folder.open(resume=self.resume)
         self.context.say(f"Run folder: {self.folder.path}")
@@ -109,10 +109,10 @@ class Experiment:
         return summary
 
     def learned(self) -> Stage:
-        """The stage that learns the task, policy and counters those of the newest checkpoint.
+        """The learning stage with the policy and counters of its newest checkpoint.
 
         Raises:
-            FileNotFoundError: if the run has no such checkpoint.
+            FileNotFoundError: if the run has no checkpoint of this stage.
         """
         stage = self.method.stage()
         folder = Checkpoints(self.folder.checkpoints(stage.name), keep_last=2).newest_whole()
@@ -125,12 +125,12 @@ class Experiment:
         return stage
 
     def untrained(self) -> TensorDictModuleBase:
-        """The policy as it was before its first frame: weights that the run's seed draws, acting
-        through the synergies that learning began with, if any."""
+        """The initial policy, with weights drawn from the run's seed and the initial synergies, if
+        any."""
         return self.method.stage().learner.policy
 
     def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
-        """Evaluates the stage's present policy on the evaluation seeds."""
+        """A function that evaluates the stage's current policy on the evaluation seeds."""
         return partial(
             evaluate_task,
             stage.learner.policy,
@@ -181,7 +181,7 @@ class Experiment:
         )
 
     def _divide_frames(self) -> None:
-        """Leave to learning what does not go into what comes before it."""
+        """Give the learning stage the frames that its preparation leaves."""
         left = self.config.frames - self.method.charged
         if left < 1:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""An entry of the zoo out of a run."""
+"""Exports a run as an entry of the zoo."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _GROUPS = {
     "synergies": "synergies.kind",
     "collector": "collector.kind",
 }
-"""Groups of the configuration, and the setting that says which file was chosen."""
+"""Groups of the configuration, and the setting that identifies the chosen file."""
 
-# Where a run was and what it showed: nothing of it is in a policy.
+# Settings of location, display and resources, which do not affect the policy.
 _OF_THE_PLACE = ("run_dir", "resume", "log", "logger_kwargs", "log_every", "progress", "pictures")
 _OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed")
 
@@ -46,21 +46,21 @@ def export_run(
 ) -> Card:
     """Evaluate the policy of a run and write it as an entry of the zoo; returns its card.
 
-    The policy that is evaluated is the one that was built again from the card.
+    The evaluated policy is rebuilt from the card.
 
     Args:
         run (path): the run folder.
-        target (path): the entry's folder; its name is the entry's.
-        compose (callable): a configuration from Hydra's overrides.
-        groups (path): the folder of its groups.
+        target (path): the entry's folder, whose name becomes the entry's.
+        compose (callable): composes a configuration from Hydra's overrides.
+        groups (path): the folder of the configuration's groups.
 
     Keyword Args:
-        episodes (int): of the evaluation.
+        episodes (int): number of evaluation episodes.
 
     Raises:
-        FileNotFoundError: if the run has not begun to learn.
-        ValueError: if there is no run, it is of a release with other names, or its policy is not
-            one that an entry can hold.
+        FileNotFoundError: if the run has no checkpoint of the learning stage.
+        ValueError: if there is no run, it is from a release with other setting names, or an entry
+            cannot hold its policy.
     """
     experiment = Experiment(resumed_config(run, defaults=compose([])), resume=run)
     stage = experiment.learned()
@@ -106,10 +106,10 @@ def describe_policy(experiment: Experiment, learner: SACLearner) -> dict[str, An
 
 
 def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDictModuleBase:
-    """The policy that the description and the weights of another make.
+    """A policy built from the description, with the weights of ``policy``.
 
     Raises:
-        ValueError: if the description is not of that policy.
+        ValueError: if the description does not match ``policy``.
     """
     again = make_policy(**described)
     try:
@@ -123,8 +123,8 @@ def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDi
 
 
 def command_of(config: DictConfig, compose: Compose, groups: Path, name: str) -> str:
-    """The command whose configuration is this one, but for what concerns place and display; the
-    synergies of the entry of this name stand for those that the run was given.
+    """The command that gives this configuration, without settings of location and display. If the
+    run was given synergies, the command uses those of the entry ``name``.
     """
     chosen: list[str] = []
     unread = set()
@@ -148,15 +148,15 @@ def command_of(config: DictConfig, compose: Compose, groups: Path, name: str) ->
 
 
 def _says(file: Path, key: str) -> Any:
-    """A setting in a file of a group, which writes it in full or as one of its own."""
-    with suppress(Exception):  # a file that nobody chose may hold anything
+    """The value of a setting in a group's file, under its full or its short key."""
+    with suppress(Exception):  # files that are not chosen may hold anything
         content = OmegaConf.load(file)
         return OmegaConf.select(content, key, default=content.get(key.rpartition(".")[2]))
     return None
 
 
 def _differences(base: dict, mine: dict, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Settings of ``mine`` that ``base`` has otherwise, as Hydra's overrides name them."""
+    """Settings of ``mine`` that differ from ``base``, as Hydra's overrides."""
     for key, value in mine.items():
         path = f"{prefix}{key}"
         if path in _OF_THE_PLACE:
@@ -183,7 +183,7 @@ def _in_words(value: Any) -> str:
 
 
 def _reads_as_itself(text: str) -> bool:
-    """Whether Hydra takes a word without quotes for this text, and not for a number or a list."""
+    """Whether Hydra parses the unquoted text as this string, not as a number or a list."""
     with suppress(ValueError):
         return parse_override(f"word={text}").value() == text
     return False

@@ -1,4 +1,4 @@
-"""Packages that only some parts need, and the extra of this one that installs them."""
+"""Error messages for optional packages, with the extra that installs them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ __all__ = ["extra"]
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Where packages are imported that ``pip install torchrl_etl[name]`` brings.
+    """A context for importing packages that ``pip install torchrl_etl[name]`` installs.
 
     Args:
-        name (str): of the extra in ``pyproject.toml``.
+        name (str): name of the extra in ``pyproject.toml``.
 
     Raises:
         ImportError: naming the package and the extra, if one is missing.

@@ -1,4 +1,4 @@
-"""Which library MuJoCo draws with; imports nothing that could import MuJoCo."""
+"""MuJoCo's rendering backend. This module imports nothing that could import MuJoCo."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _TRY = "import mujoco; mujoco.GLContext(16, 16).make_current()"
 _LIBRARIES = {"egl": ("libEGL", "libegl1"), "osmesa": ("libOSMesa", "libosmesa6")}
 _ON, _OFF = ("enable", "enabled", "on", "true", "1"), ("disable", "disabled", "off", "false", "0")
 _TAKEN = ("", "glfw", "glx", *_ON, *_OFF)
-"""What MuJoCo takes besides on Linux; none of it needs a library when it is imported."""
+"""Other values that MuJoCo accepts on Linux; none needs a library at import."""
 
 
 def ignore_unusable_backend() -> None:
-    """Warn and forget a ``MUJOCO_GL`` that is no back end, or whose library is missing.
+    """Unset ``MUJOCO_GL``, with a warning, if it is no backend or its library is missing.
 
-    MuJoCo reads it and opens that library when it is imported, and so nothing would run, whether it
-    draws or not. The warning names the package to install, or what can be named instead.
+    MuJoCo reads it and loads the library at import, so nothing would run, even without rendering.
+    The warning names the package to install, or the valid backends.
     """
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
     if sys.platform != "linux" or backend in _TAKEN:
@@ -37,12 +37,11 @@ def ignore_unusable_backend() -> None:
 
 
 def draw_without_display() -> None:
-    """Let MuJoCo draw through EGL, or else OSMesa, where there is no display.
+    """Without a display, let MuJoCo render through EGL, or else OSMesa.
 
-    MuJoCo chooses its back end when it is first imported (by TorchRL, for one), so call this before
-    any such import. Whether a library works is known only once it has drawn, so each is tried, in a
-    process of its own. A ``MUJOCO_GL`` that is set already is left as it is, and so it is if
-    neither works.
+    MuJoCo chooses its backend when it is first imported, for example by TorchRL, so call this
+    before. Only rendering shows whether a library works, so each is tried in a subprocess.
+    ``MUJOCO_GL`` stays unchanged if it is set already, or if neither works.
     """
     has_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if sys.platform != "linux" or has_display or os.environ.get("MUJOCO_GL"):

@@ -1,4 +1,4 @@
-"""Several runs at the same time, each in a process of its own."""
+"""Several runs in parallel, each in its own process."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ Ended = tuple[Path, dict[str, Any] | BaseException]
 
 
 def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:
-    """Do all runs at once; one that fails, is stopped or is killed leaves the others to go on.
+    """Do all runs in parallel; the others continue if one fails, is stopped or is killed.
 
-    On a CPU that is the fastest way: of several runs in one process all that Python does takes
-    turns, simulators included. Cores are divided among them. A signal to stop is passed on, once.
+    This is the fastest way on a CPU: within one process, Python code, simulators included, would
+    run serially. Cores are divided among the runs. A stop signal is forwarded once.
 
     Args:
-        runs (sequence of mapping): arguments of :class:`~torchrl_etl.experiment.Experiment`, all
-            of them, and such as can be pickled.
+        runs (sequence of mapping): picklable arguments of
+            :class:`~torchrl_etl.experiment.Experiment`, with ``config`` and ``resume``.
 
     Returns:
-        list: the run folder of each, and what :meth:`~torchrl_etl.experiment.Experiment.run`
-        returned or the exception that ended it.
+        list: for each run its folder, and the return value of
+        :meth:`~torchrl_etl.experiment.Experiment.run` or the exception that ended it.
     """
     context, threads = get_context("spawn"), max(1, available_cores() // len(runs))
     working, ends = {}, {}
     with StopOnSignal() as stop:
-        # A Ctrl-C in the terminal is for this process to pass on, and what it passes on waits until
-        # a process can save.
+        # This process forwards Ctrl-C as SIGTERM. Children ignore SIGINT, and block SIGTERM until
+        # they can save.
         on_interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
         for index, run in enumerate(runs):
@@ -68,7 +68,7 @@ def in_processes(runs: Sequence[Mapping[str, Any]]) -> list[Ended]:
 
 
 def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
-    """What a process does."""
+    """Main function of a run's process."""
     os.setsid()
     quiet_torchrl()
     torch.set_num_threads(threads)
@@ -81,14 +81,14 @@ def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
         except (Exception, Interrupted) as error:
             error.add_note(traceback.format_exc())
             end = error
-    with suppress(BrokenPipeError):  # whoever waited was killed
+    with suppress(BrokenPipeError):  # the parent was killed
         sender.send((experiment.folder.path, end))
 
 
 def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
     try:
         return receiver.recv()
-    except EOFError:  # it was killed
+    except EOFError:  # the process was killed
         process.join()
         folder = Path(run["resume"] or run["config"].run_dir)
         return folder, ChildProcessError(

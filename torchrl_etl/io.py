@@ -1,6 +1,6 @@
-"""Read and replace files: what is wrong with one is one sentence, and a crash leaves no mixture.
+"""Read and replace files, with one-sentence errors.
 
-A crash in the middle of a replacement leaves the old files or the new ones.
+A crash during a replacement leaves either the old files or the new ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Content = TypeVar("Content", dict[str, Any], list[Any])
 
 
 def read_bytes(path: Path, error: type[Exception], cure: str) -> bytes:
-    """The content of a file; if it cannot be read, an ``error`` whose sentence ends in the cure.
+    """The content of a file. If it cannot be read, raises ``error`` with ``cure`` as advice.
 
     Examples:
         >>> read_bytes(Path("card.json"), ValueError, "copy it again")
@@ -44,10 +44,10 @@ def read_bytes(path: Path, error: type[Exception], cure: str) -> bytes:
 
 
 def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str) -> Content:
-    """The object (``dict``) or array (``list``) that a JSON file holds.
+    """The object (``dict``) or array (``list``) in a JSON file.
 
-    The arguments besides ``kind`` are those of :func:`read_bytes`; a file that is not JSON, or
-    holds anything else, raises the same ``error``.
+    Other arguments as for :func:`read_bytes`. A file that is not JSON, or holds another type,
+    raises the same ``error``.
     """
     text = read_bytes(path, error, cure)
     try:
@@ -62,9 +62,9 @@ def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str
 def own_folder(
     path: str | os.PathLike[str], names: Collection[str], what: str, error: type[ValueError]
 ) -> Path:
-    """A folder to be replaced, which may hold files of these names and nothing else.
+    """The resolved path of a folder to be replaced, which may hold only files of these names.
 
-    Where it does, or is a file, the ``error`` says in words ``what`` was to be saved there.
+    If it holds others, or is a file, raises ``error``; ``what`` names the content to be saved.
 
     Examples:
         >>> own_folder("recipes", ["card.json"], "an entry", ValueError)
@@ -86,12 +86,12 @@ def own_folder(
 
 
 def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make ``folder`` hold exactly ``files``; whatever it held before is removed.
+    """Replace the content of ``folder`` by ``files``. Creates parent folders.
 
-    The files are written to a hidden sibling and flushed to disk. No call that works everywhere
-    exchanges two folders, so the old one first steps aside under a hidden name; until the new one
-    has its place, :func:`surviving_folder` finds the old one there. One process at a time may
-    write to a folder, whose parents are created.
+    The files are written to a hidden sibling folder and flushed to disk. No portable call swaps two
+    folders, so the old one is first renamed to a hidden name. Until the new one is in place,
+    :func:`surviving_folder` finds the old one there. Only one process at a time may write to a
+    folder.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -104,7 +104,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     parent, aside = folder.parent, _aside(folder)
     parent.mkdir(parents=True, exist_ok=True)
-    if aside.exists() and not folder.exists():  # a crash came between the two moves below
+    if aside.exists() and not folder.exists():  # an earlier crash between the two moves below
         os.replace(aside, folder)
     for stale in parent.glob(f".{folder.name}.saving-*"):
         shutil.rmtree(stale, ignore_errors=True)
@@ -130,7 +130,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def surviving_folder(folder: Path) -> Path:
-    """Where the content of ``folder`` is: there, or aside if a replacement was cut short.
+    """The path with the content of ``folder``: its hidden name if a replacement was interrupted.
 
     Examples:
         >>> surviving_folder(Path("nowhere"))
@@ -161,7 +161,7 @@ def _write_to_disk(path: Path, content: bytes) -> None:
 def as_json(content: Any) -> str:
     """JSON text with a line for each entry.
 
-    JSON knows no NaN (the interval of a single episode, say); null stands for it.
+    NaN, such as the interval of a single episode, becomes null.
 
     Examples:
         >>> as_json({"low": float("nan")})
@@ -172,7 +172,7 @@ def as_json(content: Any) -> str:
 
 
 def flush_folder(folder: Path) -> None:
-    """Put the folder's own entries, not only its files' contents, on disk."""
+    """Flush the entries of a folder to disk, not only the contents of its files."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -181,10 +181,9 @@ def flush_folder(folder: Path) -> None:
 
 
 def reserve(path: Path) -> None:
-    """Take the disk space that a sparse file has only promised.
+    """Allocate the disk space of a sparse file, or raise an ``OSError``.
 
-    Whoever writes through a memory map of a file that finds no space any more is killed by a bus
-    error; here it is an ``OSError`` that says so.
+    Without it, writing through a memory map to a full disk kills the process with a bus error.
     """
     with path.open("r+b") as file:
         _allocate(file, path.stat().st_size, path.parent)
@@ -193,8 +192,7 @@ def reserve(path: Path) -> None:
 def require_room(folder: Path, size: int) -> None:
     """Raise an ``OSError`` unless ``size`` more bytes can be written to ``folder``.
 
-    Asked by taking them for a moment, since quotas and limits do not show in what a disk says is
-    free.
+    Allocates them briefly, since the reported free space ignores quotas and limits.
     """
     folder.mkdir(parents=True, exist_ok=True)
     probe = folder / f".room-{os.getpid()}"

@@ -1,4 +1,4 @@
-"""Which processes collect and how many threads learn: tried out before a run begins."""
+"""Chooses the number of collector workers and learner threads by a short benchmark."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Layout", "choose_layout", "layouts", "train_on", "training_speed"]
 
-CLEARLY_FASTER = 1.05  # what processes of their own must gain to be worth it
+CLEARLY_FASTER = 1.05  # required speedup of worker processes over a single process
 
 
 class Layout(NamedTuple):
-    """A way to share the cores.
+    """An allocation of the cores.
 
     Attributes:
-        num_workers (int): processes that collect; 0: the learner's process does.
-        threads (int): of PyTorch in the learner's process.
-        ahead (bool): workers collect a batch while the learner learns on the last; else they take
-            turns.
+        num_workers (int): number of collector processes; with 0, the learner's process collects.
+        threads (int): PyTorch threads of the learner's process.
+        ahead (bool): whether workers collect the next batch while the learner updates; otherwise
+            they take turns.
     """
 
     num_workers: int
@@ -38,7 +38,7 @@ class Layout(NamedTuple):
 
     @property
     def collector(self) -> dict[str, str | int | bool]:
-        """What the configuration's section of this name says then."""
+        """Settings for the configuration's section ``collector``."""
         kind, workers = ("process", self.num_workers) if self.num_workers else ("single", 1)
         return {"kind": kind, "num_workers": workers, "ahead": self.num_workers > 0 and self.ahead}
 
@@ -52,23 +52,21 @@ class Layout(NamedTuple):
 def choose_layout(
     config: DictConfig, *, seconds: float = 2.0, say: Callable[[str], None] = lambda line: None
 ) -> DictConfig:
-    """The configuration with ``collector.kind=auto`` and ``threads`` settled for this machine.
+    """A copy of the configuration with ``collector.kind=auto`` and ``threads`` resolved.
 
-    Trains with the run's own networks, simulators and replay ratio in each of :func:`layouts` for
-    a moment, compiled if the run will be, and takes the fastest. Nothing of that training is kept:
-    the run is the one that the chosen settings give. They are saved with its configuration.
+    Trains for a few seconds in each of :func:`layouts`, with the run's networks, simulators,
+    replay ratio and compilation, and takes the fastest. Nothing of this training is kept: the
+    run is the same as with the chosen settings given. They are saved with its configuration.
 
     Args:
-        config (DictConfig): see ``recipes/conf/config.yaml``. A number of threads that it gives is
-            kept.
+        config (DictConfig): see ``recipes/conf/config.yaml``. If it sets ``threads``, this is kept.
 
     Keyword Args:
-        seconds (float): to train in each. Default: 2.
-        say (callable): told in one line what was measured and chosen.
+        seconds (float): training time in each. Default: 2.
+        say (callable): called with one line on the measurements and the choice.
 
     Raises:
-        ValueError: if the configuration is not one that can run, or asks for several seeds, which
-            would be measured as one.
+        ValueError: if the configuration is invalid or asks for several seeds.
     """
     if config.seeds is not None:
         raise ValueError(
@@ -98,15 +96,15 @@ def choose_layout(
 
 
 def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[Layout]:
-    """Ways to share so many cores, that of one process first.
+    """Candidate allocations of ``cores``, the single process first.
 
-    Beside workers the learner has the cores that they leave, or all: workers that are ahead wait.
-    As many workers as there are cores take turns with a learner that has them all.
+    With workers ahead, the learner gets the remaining cores, or all, since such workers also wait.
+    In the last candidate, a maximal number of workers takes turns with a learner on all cores.
 
     Args:
         cores (int): cores of the machine.
-        most_workers (int): workers that can share a batch; a power of two of them does.
-        threads (int, optional): of the learner in all of them.
+        most_workers (int): maximal number of workers; candidates are powers of two dividing it.
+        threads (int, optional): fixes the learner's threads.
 
     Examples:
         >>> for layout in layouts(2, most_workers=8):
@@ -128,13 +126,13 @@ def layouts(cores: int, most_workers: int, threads: int | None = None) -> list[L
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
-    """How fast a stage trains in a layout."""
+    """Training speed of a stage in a layout."""
     torch.set_num_threads(layout.threads)
     stage.collect_from(**layout.collector)
     stage.restart_collection()
@@ -142,14 +140,14 @@ def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
 
 
 def train_on(stage: Stage) -> None:
-    """Collect a batch, and make the updates that it has earned."""
+    """Collect a batch and make its updates."""
     stage.collect()
     alone(stage.learn())
 
 
 def training_speed(stage: Stage, seconds: float) -> float:
-    """Frames a second of a stage as it is."""
-    train_on(stage)  # compiles; its frames may have been collected before
+    """Frames per second of a stage in its current layout."""
+    train_on(stage)  # compiles; the batch may have been collected ahead of time
     begun, before = time.perf_counter(), stage.frames
     while time.perf_counter() - begun < seconds or stage.frames == before:
         train_on(stage)

@@ -1,4 +1,4 @@
-"""Runs, bundles and entries of the zoo opened to be looked at: what in them can move a body."""
+"""Opens runs, bundles and zoo entries for the viewer: their policies and synergies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["open_bundle", "open_run", "open_zoo"]
 
 
 def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
-    """The policies and the synergies of a run; episode 0 is the first that it is evaluated on.
+    """The policies and synergies of a run. Episode 0 is its first evaluation episode.
 
     Args:
         run (path): the run folder.
@@ -33,14 +33,14 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
         defaults (DictConfig, optional): see :func:`~torchrl_etl.training.resumed_config`.
 
     Raises:
-        ValueError: if the folder holds no run, or nothing yet that would move a body.
+        ValueError: if the folder holds no run, or the run has neither policy nor synergies yet.
     """
     experiment = Experiment(resumed_config(run, ["device=cpu"], defaults=defaults), resume=run)
     context, task = experiment.context, experiment.task
     subject = Subject(
         str(run),
         task,
-        lambda goal: context.make_env(name=task.name, goal=goal),  # an id would name one goal
+        lambda goal: context.make_env(name=task.name, goal=goal),  # an id would fix the goal
         context.spec.actuators,
         episode_steps=math.ceil(longest_episode(context.task) / context.config.action_repeat),
         first_seed=EVALUATION_SEED,
@@ -57,18 +57,17 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
 def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None) -> Subject:
     """The synergies of a bundle on a body.
 
-    A bundle holds no code, so the task that it names is not imported: pass one of a module of your
-    own as ``env``.
+    Opening a bundle imports no user module. Pass a task of your own as ``env``.
 
     Args:
         bundle (path): the bundle's folder, or a run folder.
-        env (str, optional): a task of the body. Default: the one that the bundle was explored on.
+        env (str, optional): a task with the same body. Default: the task of its exploration.
 
     Keyword Args:
         goal (str, optional): see :func:`~torchrl_etl.envs.resolve_task`.
 
     Raises:
-        BundleError: if there is no bundle, it is of another body, or its task is one of a module
+        BundleError: if there is no bundle, it is for another body, or its task is from a module
             that has not been imported.
         ValueError: if there is no such task.
     """
@@ -92,17 +91,17 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
 
 
 def open_zoo(name: str, env: str | None = None) -> Subject:
-    """The policy of an entry of the zoo, and its synergies where it acts through some.
+    """The policy of a zoo entry, and its synergies if it has any.
 
-    An entry of synergies alone is shown on the task that they were explored on.
+    Synergies without a policy are shown on the task of their exploration.
 
     Args:
         name (str): an entry, see :func:`torchrl_etl.zoo.find`.
-        env (str, optional): its task, where that is of a module of your own.
+        env (str, optional): the entry's task; required if it is from a module of your own.
 
     Raises:
         ZooError: if there is no such entry, or its policy is damaged.
-        BundleError: if its synergies are, see :func:`open_bundle`.
+        BundleError: if its synergies are damaged, see :func:`open_bundle`.
 
     Examples:
         >>> from torchrl_etl.opened import open_zoo
@@ -131,7 +130,7 @@ def open_zoo(name: str, env: str | None = None) -> Subject:
 
 
 def _with_policy(subject: Subject, experiment: Experiment) -> Subject:
-    """With the policy that learned the task, and the decoder that it acts through."""
+    """Adds the learned policy and its decoder."""
     if _newest(experiment, "learn") is not None:
         learner = experiment.learned().learner
         return replace(subject, policy=learner.policy, decoder=learner.decoder)
@@ -139,7 +138,7 @@ def _with_policy(subject: Subject, experiment: Experiment) -> Subject:
 
 
 def _with_explorer(subject: Subject, experiment: Experiment) -> Subject:
-    """With stage 1's policy, if the run explored."""
+    """Adds the policy of stage 1, if the run explored."""
     folder = _newest(experiment, "explore")
     explorer = None if folder is None else experiment.method.explorer()
     if explorer is None:

@@ -1,4 +1,4 @@
-"""A user's own code by its name, ``"module:name"``."""
+"""Imports of user code named ``"module:name"``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ T = TypeVar("T")
 
 
 def check_imported(name: object, source: str, error: type[ValueError], remedy: str) -> None:
-    """Refuse a name out of a file that holds no code if a module would be imported for it.
+    """Reject a name read from a data file if using it would import a new module.
 
-    The error, of the given type, says what has this name, ``source``, and what a person can do who
-    trusts the module, ``remedy``.
+    The error message begins with ``source``, the origin of the name. ``remedy`` tells users who
+    trust the module what to do.
 
     Examples:
         >>> import fractions
@@ -39,12 +39,12 @@ def check_imported(name: object, source: str, error: type[ValueError], remedy: s
 
 
 def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T]:
-    """The class of a kind: one of ``kinds``, or of one's own where it is ``"module:Class"``, which
-    must be derived from ``base``.
+    """The class of a kind: one of ``kinds``, or a user's subclass of ``base`` as
+    ``"module:Class"``.
 
     Raises:
         ImportError: if there is no such module.
-        ValueError: if the name is unknown, or the module has no such class.
+        ValueError: if the name is unknown, or the module has no such subclass.
 
     Examples:
         >>> find_class("whole", {"whole": int, "real": float}, object)
@@ -74,12 +74,12 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
 def import_own(module: str, usage: str) -> ModuleType:
     """Import a module that is installed or in the current folder.
 
-    The current folder is looked into last; a script in another folder would not see it. ``usage``
-    says what it is for, and how to name it.
+    The current folder is added at the end of ``sys.path``, since scripts in other folders lack it.
+    ``usage`` goes into the error message: what the module is for, and how to name it.
 
     Raises:
-        ImportError: if there is no such module. What the module itself fails to import is for its
-            author to see as it is.
+        ImportError: if there is no such module. Failing imports inside the module raise their own
+            errors.
     """
     here = os.getcwd()
     if here not in sys.path:
@@ -93,6 +93,6 @@ def import_own(module: str, usage: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):  # it is there, but what it needs is not
+        if not f"{module}.".startswith(f"{error.name}."):  # it exists, but lacks a dependency
             raise
         raise fault from error

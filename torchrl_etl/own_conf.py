@@ -1,4 +1,4 @@
-"""A user's own YAML files: the folder ``conf`` in the folder that a command is started from."""
+"""A user's own YAML files, in the folder ``conf`` of the working directory."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ OWN = Path("conf")
 
 
 def group_files(groups: Path, group: str) -> dict[str, Path]:
-    """Files that may be chosen of a group, by name: the recipes' in ``groups``, and one's own.
+    """Files of a group by name: those of the recipes in ``groups``, and the user's.
 
     Examples:
         >>> sorted(group_files(Path("recipes/conf"), "learner"))
         ['plain']
     """
     found: dict[str, Path] = {}
-    for conf in (groups, OWN):  # of two with one name Hydra, too, takes the recipes'
+    for conf in (groups, OWN):  # on equal names the recipes' file wins, as in Hydra
         for file in sorted((conf / group).glob("*.yaml")):
             found.setdefault(file.stem, file)
     return found
 
 
 class _OwnFolder(SearchPathPlugin):
-    """Lets Hydra look there last, wherever a configuration is composed."""
+    """Adds the user's folder at the end of Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         if OWN.is_dir():
-            search_path.append("torchrl_etl", f"file://{OWN.resolve()}")  # spaces as they are
+            search_path.append("torchrl_etl", f"file://{OWN.resolve()}")  # spaces not escaped
 
 
 Plugins.instance().register(_OwnFolder)

@@ -1,4 +1,4 @@
-"""Trained policies and synergy bundles to begin from: two lines load one.
+"""Trained policies and synergy bundles, loaded in two lines.
 
 >>> from torchrl_etl import zoo
 >>> policy, env = zoo.load("overactuated")

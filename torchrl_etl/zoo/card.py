@@ -1,4 +1,4 @@
-"""What is said of an entry of the zoo: ``card.json``."""
+"""The description of a zoo entry: ``card.json``."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ WEIGHTS = "policy.safetensors"
 
 
 class ZooError(ValueError):
-    """An entry of the zoo cannot be written, read or used; the message says why and what helps."""
+    """An entry of the zoo cannot be written, read or used; the message gives reason and remedy."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """What ``card.json`` says.
+    """The content of ``card.json``.
 
     Args:
         task (dict): arguments of :func:`~torchrl_etl.envs.make_env`: ``name``, ``goal`` and so on.
         actuators (list of str): names of the n actuators, in action order.
         policy (dict): arguments of :func:`~torchrl_etl.zoo.make_policy`.
-        training (dict): ``method``, ``frames`` (all that were charged), ``seed``, ``commit``,
-            ``versions`` and the ``command``.
-        evaluation (dict): ``return``, ``solved`` and ``solved_time`` with 95 % intervals, where the
-            task defines them, and each episode's own numbers, as
-            :meth:`Evaluation.summary <torchrl_etl.training.Evaluation.summary>` has them.
+        training (dict): ``method``, ``frames`` (total, with those before learning), ``seed``,
+            ``commit``, ``versions`` and the ``command``.
+        evaluation (dict): ``return``, ``solved`` and ``solved_time`` with 95 % intervals, if the
+            task defines them, and the values of each episode, from
+            :meth:`Evaluation.summary <torchrl_etl.training.Evaluation.summary>`.
         sha256 (str): digest of the weights.
-        format_version (int): version of this layout.
+        format_version (int): version of this format.
     """
 
     task: dict[str, Any]
@@ -47,7 +47,7 @@ class Card:
 
     @property
     def json(self) -> str:
-        """The file's text; a list of numbers takes a line."""
+        """The file's text, with each innermost list on one line."""
         lists = re.compile(r"\[[^][{}]*\]")
         return lists.sub(lambda found: re.sub(r"\s*\n\s*", " ", found[0]), as_json(asdict(self)))
 
@@ -56,7 +56,7 @@ class Card:
         """The card in a folder.
 
         Raises:
-            ZooError: if there is none that this release understands.
+            ZooError: if there is no card, or this release cannot read it.
         """
         path = folder / CARD
         content = read_json(path, dict, ZooError, "copy the entry again")

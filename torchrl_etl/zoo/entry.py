@@ -1,4 +1,4 @@
-"""An entry of the zoo: a folder with a card, weights and, where there is one, a synergy bundle."""
+"""A zoo entry: a folder with a card and weights, a synergy bundle, or both."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def names(*, trained: bool = False) -> list[str]:
     """Names of the entries that come with torchrl_etl.
 
     Keyword Args:
-        trained (bool): leave out those of synergies alone. Default: ``False``.
+        trained (bool): only entries with a policy. Default: ``False``.
 
     Examples:
         >>> "myohand" in names(), "myohand" in names(trained=True)
@@ -55,7 +55,7 @@ def names(*, trained: bool = False) -> list[str]:
 
 
 def find(name: str | os.PathLike[str]) -> Path:
-    """The folder of an entry: one that comes with torchrl_etl, or any other by its path.
+    """The folder of an entry, by its name in torchrl_etl or by its path.
 
     Raises:
         ZooError: if there is none.
@@ -82,10 +82,10 @@ def find(name: str | os.PathLike[str]) -> Path:
 
 
 def read_card(name: str | os.PathLike[str]) -> Card:
-    """What is known of an entry, see :class:`Card`.
+    """The :class:`Card` of an entry.
 
     Raises:
-        ZooError: if there is no such entry, or its card is damaged.
+        ZooError: if there is no such entry, or its card is missing or damaged.
     """
     folder = find(name)
     if not (folder / CARD).exists():
@@ -105,19 +105,20 @@ def load(
 ) -> tuple[TensorDictModuleBase, EnvBase]:
     """A trained policy and the environment of its task.
 
-    The policy acts without noise unless a collector asks for it, and writes muscle actions: a
-    decoder, where it has one, is a part of it. Nothing in an entry is executed. The digest guards
-    against damage, not against forgery.
+    The policy is deterministic unless a collector sets another exploration type. It writes muscle
+    actions and includes its decoder, if any. Loading executes no code of the entry. The digest
+    protects against damage, not against forgery.
 
     Args:
         name (str or path-like): an entry, see :func:`find`.
 
     Keyword Args:
-        env (EnvBase, optional): an environment to act in. Default: one of the entry's task.
-        device (torch.device, optional): of the policy and of that environment. Default: the CPU.
+        env (EnvBase, optional): an environment to act in. Default: a new one on the entry's task.
+        device (torch.device, optional): device of the policy and the new environment.
+            Default: the CPU.
 
     Raises:
-        ZooError: if there is no such entry, it is damaged, or its policy is not one of the
+        ZooError: if there is no such entry, it is damaged, or its policy does not match the
             environment's sizes, bounds and muscles.
 
     Examples:
@@ -137,16 +138,16 @@ def load(
 def untrained(
     name: str | os.PathLike[str], *, device: torch.device | str | None = None
 ) -> TensorDictModuleBase:
-    """What an entry's policy would do without training: its networks with weights drawn anew.
+    """An entry's policy with newly initialized networks, as an untrained baseline.
 
-    The decoder, where there is one, is the trained one; an entry does not hold the first weights of
-    its run.
+    A decoder keeps its trained weights. The other weights are not the initial ones of the entry's
+    run, which an entry does not store.
 
     Args:
         name (str or path-like): an entry, see :func:`find`.
 
     Keyword Args:
-        device (torch.device, optional): of the policy. Default: the CPU.
+        device (torch.device, optional): device of the policy. Default: the CPU.
 
     Raises:
         ZooError: if there is no such entry, or it is damaged.
@@ -168,7 +169,7 @@ def untrained(
 
 
 def synergies(name: str | os.PathLike[str]) -> Path:
-    """The folder of an entry's synergy bundle, as ``synergies=zoo:NAME`` takes it.
+    """The folder of an entry's synergy bundle, for ``synergies=zoo:NAME``.
 
     Raises:
         ZooError: if there is no such entry, or it has no bundle.
@@ -180,10 +181,10 @@ def synergies(name: str | os.PathLike[str]) -> Path:
 
 
 def bundle_path(given: str) -> Path:
-    """Where the synergies are that a setting names: a path, or an entry as ``zoo:NAME``.
+    """The folder of a bundle given as a path, or as ``zoo:NAME``.
 
     Raises:
-        ZooError: as :func:`synergies` does.
+        ZooError: as :func:`synergies`.
 
     Examples:
         >>> bundle_path("zoo:myohand") == synergies("myohand")
@@ -208,10 +209,10 @@ def synergies_alone(name: str | os.PathLike[str]) -> bool:
 
 
 def trust(name: str | os.PathLike[str], env: str) -> None:
-    """Import the module of an entry's task, which a card does not get to do, for who names it.
+    """Import the module of an entry's task, which the user must name, since cards import nothing.
 
     Raises:
-        ZooError: if that is not its task.
+        ZooError: if ``env`` is not the entry's task.
     """
     if env != (task := read_card(name).task.get("name")):
         raise ZooError(f"The task of {find(name)} is {task!r} and not {env!r}; pass that.")
@@ -225,20 +226,19 @@ def save_entry(
     *,
     bundle: str | os.PathLike[str] | None = None,
 ) -> Path:
-    """Write an entry, whole or not at all; one that is there is replaced.
+    """Write an entry atomically, replacing an existing one.
 
     Args:
         folder (path-like): the entry's folder; parents are created.
-        policy (TensorDictModuleBase): one of :func:`~torchrl_etl.zoo.make_policy`, or the policy of
-            a learner that the card describes.
-        card (Card): the digest is filled in.
+        policy (TensorDictModuleBase): a policy that the card describes, from
+            :func:`~torchrl_etl.zoo.make_policy` or of a learner.
+        card (Card): the entry's card; its digest is filled in.
 
     Keyword Args:
         bundle (path-like, optional): a synergy bundle or a run folder that holds one.
 
     Raises:
-        ZooError: if the folder holds anything but an entry, or the card does not describe the
-            policy.
+        ZooError: if the folder holds other files, or the card does not describe the policy.
     """
     folder = own_folder(folder, (CARD, WEIGHTS, *BUNDLE_FILES), "an entry", ZooError)
     state = {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}

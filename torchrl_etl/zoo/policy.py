@@ -1,4 +1,4 @@
-"""A trained learner's policy, built again from what its card says of the networks."""
+"""Rebuilds a trained learner's policy from the description in its card."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ACTORS: dict[str, Callable[..., ProbabilisticTensorDictSequential]] = {
     "lattice": make_lattice_actor,
     "dynsyn": make_dynsyn_actor,
 }
-"""What makes an actor, by its kind."""
+"""Factory functions of actors by kind."""
 
 
 def make_policy(
@@ -38,19 +38,19 @@ def make_policy(
     decoder: Mapping[str, Any] | None = None,
     normalize_observations: bool = False,
 ) -> TensorDictModuleBase:
-    """The policy of a :class:`~torchrl_etl.learners.SACLearner`, with weights still to be loaded.
+    """The policy of a :class:`~torchrl_etl.learners.SACLearner`, before its weights are loaded.
 
-    By default it acts without noise; a collector, which asks for it, gets noise.
+    By default it is deterministic; it samples if a collector sets that exploration type.
 
     Keyword Args:
         observation_dim (int): size of an observation.
         low, high (list of float): bounds of the action [n].
-        actor (mapping): its ``kind``, one of :data:`ACTORS`, and arguments of its function.
-        decoder (mapping, optional): what :func:`describe_decoder` says of it.
-        normalize_observations (bool): whether the actor reads them normalized.
+        actor (mapping): its ``kind``, one of :data:`ACTORS`, and arguments of that function.
+        decoder (mapping, optional): description from :func:`describe_decoder`.
+        normalize_observations (bool): whether the actor reads normalized observations.
 
     Raises:
-        TypeError, ValueError: for arguments that make no policy.
+        TypeError, ValueError: for invalid arguments.
 
     Examples:
         >>> policy = make_policy(
@@ -61,7 +61,7 @@ def make_policy(
     """
     options = dict(actor)
     check_choice("kind", kind := options.pop("kind", None), list(ACTORS))
-    # The weights drawn here are overwritten at once: do not let them advance the global seed.
+    # These initial weights will be overwritten, so keep the global generator unchanged.
     with torch.random.fork_rng(devices=[]):
         emitted, out_key, map_ = _spec(low, high), "action", None
         if decoder is not None:
@@ -79,10 +79,10 @@ def make_policy(
 
 
 def describe_decoder(decoder: SynergyMap | None) -> dict[str, Any] | None:
-    """What :func:`make_policy` builds a decoder from.
+    """The ``decoder`` argument of :func:`make_policy` for a decoder.
 
     Raises:
-        ValueError: for a decoder that is neither ETL's nor SAR's.
+        ValueError: for a decoder other than ETL's or SAR's.
 
     Examples:
         >>> describe_decoder(SynergyDecoder(2, 3, hidden=[8]))
