@@ -1,4 +1,4 @@
-"""What a run is worth: synergy diagnostics, pictures, and statistics of evaluations."""
+"""Analysis of runs: synergy diagnostics, plots, and statistics of evaluations."""
 
 from torchrl_etl.analysis.cross_validation import (
     CrossValidation,

@@ -1,4 +1,4 @@
-"""Tensors and arrays alike as float64 arrays, which is what numbers here are computed in."""
+"""Conversion of tensors and arrays to float64 arrays, the type of all computations here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["as_array", "as_matrix"]
 
 
 def as_array(values: Tensor | ArrayLike) -> np.ndarray:
-    """Numbers of any shape, wherever they are, as a float64 array.
+    """Numbers of any shape, on any device, as a float64 array.
 
     Examples:
         >>> as_array([1, 2])
@@ -22,7 +22,7 @@ def as_array(values: Tensor | ArrayLike) -> np.ndarray:
 
 
 def as_matrix(values: Tensor | ArrayLike, name: str) -> np.ndarray:
-    """Finite numbers [*, n] as a float64 array [N, n]; ``name`` is what an error calls them.
+    """Finite numbers [*, n] as a float64 array [N, n]; ``name`` is used in error messages.
 
     Examples:
         >>> import torch

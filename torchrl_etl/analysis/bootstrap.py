@@ -1,8 +1,8 @@
-"""Interquartile means of runs and how often one beats another, with bootstrap intervals.
+"""Interquartile mean and probability of improvement, with stratified bootstrap intervals.
 
-The estimators are those of Agarwal et al., "Deep reinforcement learning at the edge of the
-statistical precipice" (2021), and the intervals come from the authors' library, rliable: seeds are
-resampled within each task, so tasks stay as they are.
+The estimators are from Agarwal et al., "Deep reinforcement learning at the edge of the statistical
+precipice" (2021), and the intervals from the authors' library, rliable. Seeds are resampled within
+each task; tasks are not resampled.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ __all__ = ["iqm", "mean_band", "probability_of_improvement"]
 def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
     """Interquartile mean of the runs of all tasks, with its stratified bootstrap 95 % interval.
 
-    ``groups`` have for each task one number per seed. The ends are NaN where a task has one seed,
-    which says nothing about its spread, and without ``repetitions``, which are resamples.
+    ``groups`` has one array per task, with one number per seed. The bounds are NaN if a task has
+    only one seed, or if ``repetitions``, the number of resamples, is 0.
 
     Examples:
         >>> iqm([[1.0, 2.0, 3.0, 100.0]], repetitions=50).mean
@@ -37,14 +37,14 @@ def iqm(groups: Sequence[ArrayLike], *, repetitions: int = 2000) -> Interval:
 def probability_of_improvement(
     pairs: Sequence[tuple[ArrayLike, ArrayLike]], *, repetitions: int = 2000
 ) -> Interval:
-    """How often a run of one method beats a run of another on the same task, mean over tasks.
+    """Probability that a run of method X beats a run of method Y on a task, averaged over tasks.
 
-    ``pairs`` have for each task the one's and the other's numbers, one per seed; a tie counts one
-    half. The ends are NaN as those of :func:`iqm`.
+    ``pairs`` has one pair (x, y) per task, with one number per seed. A tie counts one half. The
+    bounds are NaN in the same cases as for :func:`iqm`.
 
     Equation:
-        1/T Σ_t 1/(N_t K_t) Σ_i Σ_j (1[x_ti > y_tj] + ½ 1[x_ti = y_tj]); what rliable computes by
-        way of the Mann-Whitney statistic, without its test, which would be most of the time here.
+        1/T Σ_t 1/(N_t K_t) Σ_i Σ_j (1[x_ti > y_tj] + ½ 1[x_ti = y_tj]). rliable computes the same
+        with SciPy's Mann-Whitney test, whose p-value would take most of the time here.
 
     Examples:
         >>> probability_of_improvement([([1.0, 3.0], [2.0, 2.0])], repetitions=0).mean
@@ -55,10 +55,10 @@ def probability_of_improvement(
 
 
 def mean_band(values: np.ndarray, *, repetitions: int = 2000) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of a band around the mean over seeds of values [seeds, evaluations].
+    """Bounds of a band around the mean over seeds of values [seeds, evaluations].
 
-    From three seeds up it is the percentile bootstrap's 95 % interval; of two seeds, or of one,
-    smallest and largest value.
+    For three or more seeds, the percentile bootstrap's 95 % interval; for fewer, the smallest and
+    largest value.
 
     Examples:
         >>> [end.tolist() for end in mean_band(np.array([[1.0, 2.0], [3.0, 2.0]]))]
@@ -86,7 +86,7 @@ def _pooled_iqm(*groups: np.ndarray) -> np.ndarray:
 
 
 def _improvement(*groups: np.ndarray) -> np.ndarray:
-    """Groups alternate between the one's runs and the other's, task by task."""
+    """Mean probability of improvement; groups alternate between methods, task by task."""
     pairs = zip(groups[::2], groups[1::2], strict=True)
     # The mean sign of all differences lies in [-1, 1], a tie at 0.
     wins = [0.5 + 0.5 * np.sign(x.ravel()[:, None] - y.ravel()).mean() for x, y in pairs]
@@ -101,7 +101,7 @@ def _interval(
         return Interval(point, math.nan, math.nan)
     with extra("statistics"):
         from rliable import library
-    # One array per task rather than one matrix: numbers of seeds may differ.
+    # One array per task rather than one matrix, since numbers of seeds may differ.
     scores = [group[:, None] for group in groups]
     with _seeded():
         _, ends = library.get_interval_estimates({"": scores}, statistic, reps=repetitions)
@@ -111,7 +111,7 @@ def _interval(
 
 @contextmanager
 def _seeded() -> Iterator[None]:
-    """rliable resamples with NumPy's global generator: seed it, and leave it as it was."""
+    """Seed NumPy's global generator, which rliable uses, and restore it afterwards."""
     state = np.random.get_state()
     np.random.seed(0)
     try:

@@ -1,4 +1,4 @@
-"""What every picture shares: figure, palette and writing to disk."""
+"""Shared parts of all plots: figure, palette and writing to disk."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ if TYPE_CHECKING:
 
 __all__ = ["MARKERS", "SERIES", "count_frames", "direction_colors", "new_figure", "tidy", "write"]
 
-# Okabe and Ito's colours, which stay apart under the common colour vision deficiencies; black
-# and yellow are left out, for text and for legibility. Markers tell series apart in grey.
+# Okabe and Ito's colours, distinct under common colour vision deficiencies. Black is reserved for
+# text; yellow is hard to read. Markers distinguish series in greyscale.
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#666666")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-# A circle of hues that also goes round in lightness and from yellow to blue, so that opposite
-# directions differ for readers who do not tell red from green.
+# A cyclic colormap that also varies in lightness and from yellow to blue, so that opposite
+# directions differ for red-green colour-blind readers.
 _CIRCLE = ("#D98200", "#A8324A", "#50206B", "#2A55C8", "#2FA3DD", "#7FD1AE", "#C9C443", "#D98200")
 
 
 @cache
 def direction_colors() -> Colormap:
-    """Colours of directions in the plane, by their angle in turns."""
+    """Colormap for directions in the plane, by their angle in turns."""
     with extra("pictures"):
         from matplotlib.colors import LinearSegmentedColormap
     return LinearSegmentedColormap.from_list("directions", _CIRCLE)
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of the given size in inches that no global list of figures knows.
+    """An empty figure of the given size in inches, outside pyplot's global state.
 
     Examples:
         >>> new_figure(6.0, 4.0).get_size_inches().tolist()
@@ -49,7 +49,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def tidy(axes: Axes) -> None:
-    """Drop the frame's upper and right side and put a faint grid behind the data."""
+    """Remove the top and right spines and put a faint grid behind the data."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="0.9", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -63,7 +63,7 @@ def count_frames(axes: Axes) -> None:
 
 
 def write(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Save as PNG, whole or not at all: nobody sees half a picture."""
+    """Save as PNG, atomically."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(content := BytesIO(), format="png")

@@ -1,4 +1,4 @@
-"""How many synergies a recording has: variance accounted for in rows that a model has not seen."""
+"""Cross-validated number of synergies: variance accounted for in held-out rows."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["CrossValidation", "cross_validate", "enough_synergies", "held_out_ro
 
 
 class CrossValidation(NamedTuple):
-    """Variance accounted for of one number of synergies, see :func:`cross_validate`.
+    """Variance accounted for (VAF) by one number of synergies, see :func:`cross_validate`.
 
     Attributes:
-        fitted (float): by the model of all rows, in these rows.
-        held_out (float): in every row by the model that was fitted without it.
-        lowest, highest (float): the same in the fold that is told worst and best.
+        fitted (float): VAF of the model fitted to all rows, in the same rows.
+        held_out (float): VAF over all rows, each reconstructed by a model fitted without it.
+        lowest, highest (float): held-out VAF of the worst and the best fold.
     """
 
     fitted: float
@@ -34,17 +34,17 @@ class CrossValidation(NamedTuple):
 
 
 def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) -> list[np.ndarray]:
-    """Which rows are held out together: whole trials, or blocks of neighbours.
+    """Folds of rows for cross-validation: whole trials, or blocks of neighbouring rows.
 
-    Neighbouring rows of a recording are nearly alike, so rows drawn at random would be no test.
+    Neighbouring rows of a recording are nearly alike, so random folds would hold out too little.
 
     Args:
         rows (int): N.
-        folds (int): into how many parts; at most as many as there are trials, or rows. Default: 5.
+        folds (int): number of folds, reduced to the number of trials or rows. Default: 5.
         trials (array, optional): the trial of each row [N].
 
     Returns:
-        list of np.ndarray: indices, each row in one of them.
+        list of np.ndarray: row indices of each fold; every row is in exactly one.
 
     Raises:
         ValueError: if there are fewer than two folds, trials or rows.
@@ -66,7 +66,7 @@ def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) ->
         raise ValueError(
             f"All rows are of trial {names[0]}, so none can be held out; pass no trials."
         )
-    # The longest first, each into the part that is shortest so far.
+    # Greedy: the longest trial first, each into the currently smallest fold.
     parts: list[list] = [[] for _ in range(min(folds, len(names)))]
     filled = np.zeros(len(parts), dtype=int)
     for i in np.argsort(-sizes, kind="stable"):
@@ -83,21 +83,21 @@ def cross_validate(
     folds: int = 5,
     trials: ArrayLike | None = None,
 ) -> tuple[CrossValidation, SynergyModel]:
-    """Fit a model to all rows and, for each fold, to all rows but those of the fold.
+    """Fit a model to all rows and, for each fold, to all rows outside the fold.
 
-    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, or those of one fold, with â of the model
-    that was fitted without the row and ā the mean of all rows. (A fold's own mean would leave a
-    fold of one row no variance to account for.)
+    Equation: 1 − Σ‖a − â‖² / Σ‖a − ā‖² over all rows, or those of one fold, with â from the model
+    fitted without the row and ā the mean of all rows. (With its own mean, a fold of one row would
+    have no variance.)
 
     Args:
-        fit (callable): a model fitted to rows [N, n] in single precision.
+        fit (callable): fits a model to float32 rows [N, n].
         activity (array): [N, n].
 
     Keyword Args:
         folds, trials: see :func:`held_out_rows`.
 
     Returns:
-        CrossValidation and the model of all rows.
+        CrossValidation and the model fitted to all rows.
 
     Raises:
         ValueError: see :func:`held_out_rows`.
@@ -129,7 +129,7 @@ def cross_validate(
 
 
 def enough_synergies(found: dict[int, CrossValidation], least: float) -> int:
-    """The fewest synergies that account for ``least`` of held-out rows, or else the best number.
+    """The fewest synergies with a held-out VAF of ``least``, or else the number with the best VAF.
 
     Examples:
         >>> found = {1: CrossValidation(0.6, 0.5, 0.4, 0.7), 2: CrossValidation(0.9, 0.8, 0.7, 0.9)}

@@ -1,4 +1,4 @@
-"""Numbers that tell whether a synergy space is worth learning in, and warnings in words."""
+"""Diagnostics of a synergy space, and warnings about it."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ __all__ = ["control_authority", "direction_alignment", "synergy_effects", "syner
 def control_authority(
     decoder: SynergyDecoder, num_samples: int = 1024, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """How far the synergies move each actuator, as a fraction of its range [n].
+    """Fraction of its range over which the synergies move each actuator [n].
 
-    It is the distance from the 5th to the 95th percentile of Dec(u), u uniform in [-1, 1]^d, over
-    high − low: 0.9 for a muscle that follows one coefficient linearly over its whole range, 0 for
-    one that never moves. A residual, if the decoder has one, is held at zero. The mean over
-    actuators is the summary.
+    The distance from the 5th to the 95th percentile of Dec(u), u uniform in [-1, 1]^d, divided by
+    high − low. It is 0.9 for a muscle that follows one coefficient linearly over its whole range,
+    and 0 for one that never moves. A residual is held at zero. Reports average it over actuators.
 
     Args:
         decoder (SynergyDecoder): the decoder.
         num_samples (int): number of random coefficients. Default: 1024.
 
     Keyword Args:
-        generator (torch.Generator, optional): source of the samples. Default: a fresh one with a
-            fixed seed, so that two calls agree and no global state moves.
+        generator (torch.Generator, optional): source of the samples. Default: a new one with a
+            fixed seed; the global generator is not used.
 
     Raises:
         ValueError: if there are fewer than two samples.
@@ -61,7 +60,7 @@ def control_authority(
 def synergy_effects(decoder: SynergyDecoder) -> Tensor:
     """Signed change of each actuator when one coefficient goes from -1 to +1 [d, n].
 
-    The other coefficients are 0, and so is a residual; 1 means the actuator's whole range.
+    The other coefficients and a residual are 0. A change of 1 is the actuator's whole range.
 
     Args:
         decoder (SynergyDecoder): the decoder.
@@ -77,14 +76,14 @@ def synergy_effects(decoder: SynergyDecoder) -> Tensor:
 
 
 def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | ArrayLike) -> float:
-    """Whether episodes went where their directions point: mean cosine between φ(s) - mean φ and z.
+    """Whether episodes moved along their directions: mean cosine between φ(s) - mean φ and z.
 
-    Near 0 the policy does not heed its direction, and exploration is undirected; 1 is the most
-    there can be. With few episodes it scatters around 0 by 1 / √(episodes · d).
+    Near 0, the policy ignores its direction and exploration is undirected; the maximum is 1. For
+    such a policy, it has a standard deviation of 1 / √(episodes · d).
 
     Args:
-        embedding (Tensor or array): φ of the states that were visited [N, d].
-        direction (Tensor or array): direction of the episode that each belongs to [N, d].
+        embedding (Tensor or array): φ of the visited states [N, d].
+        direction (Tensor or array): direction of each state's episode [N, d].
 
     Examples:
         >>> import torch
@@ -105,9 +104,9 @@ def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | Array
     return float(np.mean((place * way).sum(1) / np.maximum(lengths, 1e-12)))
 
 
-_LEAST_VAF = 0.5  # of the model or of PCA
-_BEHIND_PCA = 0.02  # how far the model may stay behind it
-_LEAST_AUTHORITY = 0.2  # on average
+_LEAST_VAF = 0.5  # of the better of model and PCA
+_BEHIND_PCA = 0.02  # by how much the model's VAF may fall below PCA's
+_LEAST_AUTHORITY = 0.2  # mean over actuators
 _CURE = "; ask for more synergies, or for those of another kind"
 _UNDERFITTED = ": it is underfitted, so train it longer or lower the weight of its KL terms"
 _CURES = {"gmvae": _UNDERFITTED, "vae": _UNDERFITTED}
@@ -116,13 +115,13 @@ _CURES = {"gmvae": _UNDERFITTED, "vae": _UNDERFITTED}
 def synergy_warnings(
     *, vaf: float, pca_vaf: float, authority: Tensor | ArrayLike, kind: str = "gmvae"
 ) -> list[str]:
-    """Say in words what is wrong with a synergy space; an empty list means nothing was found.
+    """Warnings about a synergy space, as sentences; an empty list if there are none.
 
     Keyword Args:
-        vaf (float): variance that the synergy model accounts for.
-        pca_vaf (float): variance that PCA accounts for with as many dimensions.
-        authority (Tensor or array): what :func:`control_authority` returned [n].
-        kind (str): of the synergy model. Default: ``"gmvae"``.
+        vaf (float): variance accounted for by the synergy model.
+        pca_vaf (float): variance accounted for by PCA with as many dimensions.
+        authority (Tensor or array): result of :func:`control_authority` [n].
+        kind (str): kind of the synergy model. Default: ``"gmvae"``.
 
     Examples:
         >>> synergy_warnings(vaf=0.9, pca_vaf=0.85, authority=[0.5, 0.7])

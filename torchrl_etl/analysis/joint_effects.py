@@ -1,4 +1,4 @@
-"""How much of what muscles do turns joints: activations beside the body's moment arms."""
+"""Share of the variance of muscle activations that turns joints."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["JointEffects", "joint_effects"]
 
 
 class JointEffects(NamedTuple):
-    """What :func:`joint_effects` returns."""
+    """Result of :func:`joint_effects`."""
 
     share: float
     chance: float
@@ -22,10 +22,10 @@ class JointEffects(NamedTuple):
 
 
 def joint_effects(activations: Tensor | ArrayLike, torques: Tensor | ArrayLike) -> JointEffects:
-    """Where the variance of muscle activations lies, as joints see it.
+    """Share of the variance of muscle activations that turns joints, and the resulting torques.
 
-    A change of activations outside of the row space of the torques moves no joint: the muscles that
-    change cancel out.
+    A change of activations orthogonal to the row space of the torques moves no joint: the torques
+    of the muscles cancel out.
 
     Equation: with Σ the covariance of the activations, M the torques with rows of unit length and
     P the projector on their row space, share = tr(PΣ) / tr(Σ) and
@@ -33,13 +33,13 @@ def joint_effects(activations: Tensor | ArrayLike, torques: Tensor | ArrayLike) 
 
     Args:
         activations (Tensor or array): [*, n].
-        torques (Tensor or array): torque on each of J joints of each fully active muscle [J, n],
-            as :func:`~torchrl_etl.envs.joint_torques` gives them.
+        torques (Tensor or array): torque of each fully active muscle on each of J joints [J, n],
+            from :func:`~torchrl_etl.envs.joint_torques`.
 
     Returns:
         JointEffects: ``share``, the part of the variance that turns joints, in [0, 1]; ``chance``,
-        what it is for independent muscles of the same variance, rank(M) / n; ``gain``, the torque
-        variance that a unit of activation variance gives, 1 for those independent muscles.
+        this share for independent muscles of equal variance, rank(M) / n; ``gain``, the torque
+        variance per unit of activation variance, relative to such independent muscles.
 
     Raises:
         ValueError: if the numbers of muscles differ, a joint has no torque, or activations do not

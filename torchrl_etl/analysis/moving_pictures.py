@@ -1,4 +1,4 @@
-"""Episodes side by side in a grid, as a video and as a small animated picture."""
+"""Episodes side by side in a grid, as a video and as a small animation."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = [
 ]
 
 FPS = 25
-"""Pictures in a second of video."""
+"""Frames per second of the video."""
 CAPTION_HEIGHT = 24
-"""Pixels above the grid; even, as the coding of MP4 wants."""
+"""Pixels above the grid; even, as MP4 encoding requires."""
 
-_SMALL_WIDTH = 640  # pixels of the animated picture
+_SMALL_WIDTH = 640  # pixels, of the animation
 _SMALL_SECONDS = 8
-_EVERY = 2  # the animated picture has each second frame
+_EVERY = 2  # the animation has every second frame
 
 
 def grid_shape(episodes: int) -> tuple[int, int]:
@@ -48,11 +48,11 @@ def grid_shape(episodes: int) -> tuple[int, int]:
 def side_by_side(sides: Mapping[str, Sequence[np.ndarray]]) -> Iterator[np.ndarray]:
     """Frames [24 + rows H, sides columns W, 3] that show all episodes at once.
 
-    An episode that is over stays at its last frame until the longest is over too.
+    Each episode shows its last frame until the longest one ends.
 
     Args:
-        sides (mapping): by caption, from left to right, as many episodes each; an episode is an
-            array [T, H, W, 3] of uint8.
+        sides (mapping): captions to episodes, from left to right, with equal numbers of episodes;
+            an episode is an array [T, H, W, 3] of uint8.
 
     Examples:
         >>> short, long = (np.full((t, 16, 20, 3), t, np.uint8) for t in (1, 3))
@@ -78,8 +78,8 @@ def side_by_side(sides: Mapping[str, Sequence[np.ndarray]]) -> Iterator[np.ndarr
 def write_moving_pictures(
     folder: Path, sides: Mapping[str, Sequence[np.ndarray]], name: str = "episodes"
 ) -> list[Path]:
-    """Write what :func:`side_by_side` shows into ``name.mp4`` and ``name.webp``, the latter small
-    enough for a page, in a folder that is made; returns both.
+    """Write the frames of :func:`side_by_side` to ``name.mp4`` and, small enough for a page, to
+    ``name.webp``. Creates the folder and returns both paths.
     """
     folder.mkdir(parents=True, exist_ok=True)
     video, picture = folder / f"{name}.mp4", folder / f"{name}.webp"
@@ -91,7 +91,7 @@ def write_moving_pictures(
 def _write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
     with extra("video"):
         import imageio.v2 as imageio
-    with TemporaryDirectory(prefix=".", dir=path.parent) as aside:  # ffmpeg wants a file
+    with TemporaryDirectory(prefix=".", dir=path.parent) as aside:  # ffmpeg needs a file
         whole = Path(aside) / path.name
         with imageio.get_writer(whole, fps=FPS, macro_block_size=1) as writer:
             for frame in frames:
@@ -100,8 +100,8 @@ def _write_video(path: Path, frames: Iterator[np.ndarray]) -> None:
 
 
 def animated_picture(frames: Iterable[np.ndarray], *, quality: int = 50) -> bytes:
-    """Every other frame [H, W, 3], of 25 a second, of the first eight seconds, at most 640 pixels
-    wide, as an endless WebP, in a quality from 0, the smallest, to 100.
+    """A looping WebP of every second frame [H, W, 3] of the first eight seconds at 25 frames per
+    second, at most 640 pixels wide. ``quality`` is in 0 to 100.
     """
     with extra("video"):
         from PIL import Image

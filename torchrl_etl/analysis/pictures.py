@@ -1,7 +1,7 @@
-"""Pictures of a run: learning curves, the muscles behind each synergy, how many synergies to take.
+"""Plots of a run: learning curves, the muscles of each synergy, and VAF by number of synergies.
 
-Every function draws its data into a PNG at ``path``, creating folders as needed, and returns the
-path. No state of matplotlib's is touched, so they may be called from anywhere in a training run.
+Every function writes a PNG to ``path``, creating folders as needed, and returns the path. None
+touches matplotlib's global state, so they may be called anywhere in a training run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["embedding", "learning_curves", "synergy_heatmap", "vaf_curve"]
 
 Rows = Sequence[Mapping[str, Any]]
 
-# Column of the rows, title of the axis, factor to the axis' unit.
+# Column of the rows, axis label, factor to the unit of the axis.
 _PANELS = (("return", "return per episode", 1.0), ("solved", "solved episodes [%]", 100.0))
 
 
@@ -39,16 +39,16 @@ def learning_curves(
     explore_frames: int | None = None,
     title: str | None = None,
 ) -> Path:
-    """Draw return, and success where it is known, against environment frames.
+    """Plot return, and success if known, against environment frames.
 
-    Rows with different ``seed`` are one series: its line is their mean over the frames that all
-    seeds reached, its band the 95 % confidence interval of that mean.
+    Rows with different ``seed`` form one series. Its line is the mean over seeds, on the frames
+    that all seeds reached; its band is the 95 % confidence interval of the mean.
 
     Args:
         runs: rows with ``frames`` and ``return`` or ``solved`` (a share in [0, 1]), optionally
             ``seed``; or the path of a CSV file with such columns; or a mapping of names to either.
-            Frames count from the start of the explore stage, so that methods compare at equal
-            cost. Missing values may be absent, empty or NaN.
+            Frames include the explore stage, so that methods are compared at equal cost. Missing
+            values may be absent, empty or NaN.
         path (path-like): where the PNG goes.
 
     Keyword Args:
@@ -56,8 +56,8 @@ def learning_curves(
         title (str, optional): title of the figure, such as the task.
 
     Raises:
-        ValueError: if no row has frames and a return or success, or two seeds of a series share no
-            frames.
+        ValueError: if no row has frames and a return or success, or if two seeds of a series have
+            no frames in common.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -112,10 +112,10 @@ def synergy_heatmap(
     *,
     title: str | None = None,
 ) -> Path:
-    """Draw how far each synergy pushes each muscle, and which way.
+    """Heat map of the signed effect of each synergy on each actuator.
 
-    A cell is the change of the action when one coefficient goes from -1 to +1 and the others are
-    0, in percent of the actuator's range; see
+    Each cell is the change of the action, in percent of the actuator's range, when one coefficient
+    goes from -1 to +1 and the others are 0. See
     :func:`~torchrl_etl.analysis.diagnostics.synergy_effects`.
 
     Args:
@@ -142,9 +142,9 @@ def synergy_heatmap(
         raise ValueError(
             f"{len(names)} names came for {muscles} actuators; pass one per actuator, in order."
         )
-    # A floor keeps rounding noise of an idle decoder from filling the colour scale.
+    # A minimum keeps the rounding noise of a constant decoder from filling the colour scale.
     limit = max(1.0, float(np.abs(effects).max()))
-    # Long lists of muscles are broken into lines, so that the names stay legible on a page.
+    # Many muscles are split into several rows, so that names stay legible on a page.
     lines = np.array_split(np.arange(muscles), -(-muscles // _MUSCLES_PER_LINE))
     longest = max(map(len, names))
     upright = muscles > 12 or longest > 6
@@ -181,7 +181,7 @@ def vaf_curve(
     chosen_d: int | None = None,
     title: str | None = None,
 ) -> Path:
-    """Draw the variance accounted for against the number of synergies, one line per method.
+    """Plot the variance accounted for against the number of synergies, one line per method.
 
     Args:
         dims (sequence of int): numbers of synergies.
@@ -190,7 +190,7 @@ def vaf_curve(
         path (path-like): where the PNG goes.
 
     Keyword Args:
-        chosen_d (int, optional): the number that the run uses, to be marked.
+        chosen_d (int, optional): the number of the run, marked by a line.
         title (str, optional): title of the figure, such as the task.
 
     Raises:
@@ -250,7 +250,7 @@ def _number(value: Any) -> float:
 
 
 def _curve(rows: Rows, column: str, unit: float) -> tuple[np.ndarray, ...] | None:
-    """Frames, mean and the interval's ends over seeds; None if the column has no numbers."""
+    """Frames, mean and interval bounds over seeds; None if the column has no numbers."""
     seeds: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
         point = _number(row.get("frames")), unit * _number(row.get(column))
@@ -260,8 +260,8 @@ def _curve(rows: Rows, column: str, unit: float) -> tuple[np.ndarray, ...] | Non
         return None
     lines = [np.array(sorted(points)).T for points in seeds.values()]
     frames = np.unique(np.concatenate([line[0] for line in lines]))
-    # Seeds evaluate at slightly different frames when episodes end at will: compare them on one
-    # grid, and only where none has to be extrapolated.
+    # Episodes of varying length put evaluations at slightly different frames: interpolate on a
+    # common grid, without extrapolation.
     start, stop = max(line[0, 0] for line in lines), min(line[0, -1] for line in lines)
     if start > stop:
         raise ValueError(

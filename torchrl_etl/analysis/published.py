@@ -1,8 +1,8 @@
-"""Published learning curves, to stand beside a sweep's own.
+"""Published learning curves, for comparison with a sweep.
 
 ``published_curves.csv`` holds means over seeds at 100k to 1M environment frames, taken from the
 public results of FlashSAC and of the baselines that it ships: SimbaV2, XQC, TD-MPC2, MR.Q and PPO.
-Nothing in it was measured here, and no spread over seeds came with it.
+None of them was measured here, and no spread over seeds was published.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["PublishedCurve", "best_published", "caveats", "environment_id", "pub
 
 _NAMES = {"simbaV2": "SimbaV2", "xqc": "XQC", "tdmpc2": "TD-MPC2", "mrq": "MR.Q"}
 
-# Evaluations fall a little short of round numbers of frames where episodes end at will.
+# Episodes of varying length put evaluations slightly off round numbers of frames.
 _TOLERANCE = 0.05
 
 
@@ -48,11 +48,11 @@ class PublishedCurve:
 
 
 def environment_id(task: str, goal: str = "fixed") -> str:
-    """The id under which others publish a task; a name that this project has not named itself.
+    """The environment id under which results of a task were published.
 
-    Unlike :func:`~torchrl_etl.envs.resolve_task` it builds and imports nothing, and passes unknown
-    names through, for results outlive the environments that they came from. Hand Pose was published
-    with the hand of MyoSuite 2; nothing is with that of MyoSuite 3.
+    Unlike :func:`~torchrl_etl.envs.resolve_task`, it builds and imports nothing and returns unknown
+    names unchanged, since results may outlive their environments. Hand Pose was published with the
+    hand of MyoSuite 2, and not with that of MyoSuite 3.
 
     Examples:
         >>> environment_id("myoHandKeyTurn", "random"), environment_id("dog-run")
@@ -70,8 +70,8 @@ def environment_id(task: str, goal: str = "fixed") -> str:
 
 
 def published_curves(env_id: str, metric: str = "return") -> tuple[PublishedCurve, ...]:
-    """Published curves of an environment, see :func:`environment_id`, in the order of their names:
-    of the ``"return"``, or of ``"success"``, the share of solved episodes.
+    """Published curves of an environment, see :func:`environment_id`, sorted by algorithm. The
+    metric is ``"return"`` or ``"success"``, the share of solved episodes.
 
     Examples:
         >>> [curve.algorithm for curve in published_curves("myoHandPoseFixed-v0")]
@@ -83,7 +83,7 @@ def published_curves(env_id: str, metric: str = "return") -> tuple[PublishedCurv
 
 
 def best_published(env_id: str, frames: float) -> tuple[float, str] | None:
-    """The highest published return at as many frames, and whose it is.
+    """The highest published return at this number of frames, and its algorithm.
 
     Examples:
         >>> best_published("myoHandPoseFixed-v0", 100_000)
@@ -100,7 +100,7 @@ def best_published(env_id: str, frames: float) -> tuple[float, str] | None:
 
 
 def caveats(env_id: str) -> str:
-    """What must be said wherever the published curves of an environment are shown.
+    """Caveats to print with the published curves of an environment.
 
     Examples:
         >>> print(caveats("dog-run"))

@@ -1,4 +1,4 @@
-"""A picture of the learned state embedding and the directions it was explored along."""
+"""A plot of the learned state embedding and the exploration directions."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def embedding(
     *,
     title: str | None = None,
 ) -> Path:
-    """Draw visited states in embedding space, each coloured by the direction of its episode.
+    """Plot visited states in embedding space, coloured by the direction of their episode.
 
-    If the directions steer behavior, states of one colour lie together, out along their direction.
-    Embeddings of more than two dimensions are projected on their two principal components, and
-    the directions with them; a direction that mostly points out of that plane is drawn greyish.
-    With one dimension it is a histogram for each of the two directions.
+    If the directions steer behavior, states of one colour lie together, along their direction.
+    Embeddings and directions of more than two dimensions are projected onto the embeddings' first
+    two principal components. Directions mostly orthogonal to this plane are greyish. In one
+    dimension, the plot is a histogram for each of the two directions.
 
     Args:
         embeddings (Tensor or array): φ(s) of visited states [*, k].
         directions (Tensor or array): the direction of each state's episode [*, k].
-        path (path-like): where the PNG goes.
+        path (path-like): path of the PNG.
 
     Keyword Args:
         title (str, optional): title of the figure, such as the task.
@@ -63,7 +63,7 @@ def embedding(
             f"embeddings flatten to {points.shape} and directions to {arrows.shape}; pass one "
             "direction per state, of the same size, for at least three states."
         )
-    # Shuffled: drawn in order, the last episodes would cover the first.
+    # Shuffled, since the last episodes would otherwise cover the first.
     order = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
     points, arrows = points[order], arrows[order]
     figure = new_figure(6.4, 4.6)
@@ -101,7 +101,7 @@ def _scatter(axes: Axes, points: np.ndarray, arrows: np.ndarray) -> None:
     if points.shape[1] > 2:
         with extra("pictures"):
             from sklearn.decomposition import PCA
-        # An encoder that has collapsed to a point has no variance to divide by.
+        # A collapsed encoder has zero variance: dividing by it gives NaN.
         with np.errstate(invalid="ignore"):
             model = PCA(2, svd_solver="covariance_eigh").fit(points)
         points, arrows = model.transform(points), arrows @ model.components_.T
@@ -116,14 +116,14 @@ def _scatter(axes: Axes, points: np.ndarray, arrows: np.ndarray) -> None:
 
 
 def _colors(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Hue from the angle; grey as the part of the unit vector in the plane gets short."""
+    """Hue from the angle, blended to grey as the in-plane part of the unit vector shrinks."""
     length = np.hypot(x, y).clip(max=1.0)[..., None]
     hues = direction_colors()(np.arctan2(y, x) / (2 * np.pi) % 1.0)[..., :3]
     return length * hues + (1 - length) * _GREY
 
 
 def _wheel(axes: Axes, *, disc: bool) -> None:
-    """The legend: a disc, or only its rim where every direction lies in the plane."""
+    """The legend: a disc, or only its rim if every direction lies in the plane."""
     x, y = np.meshgrid(*[np.linspace(-1, 1, 201)] * 2)
     radius = np.hypot(x, y)
     shown = (radius <= 1) & (disc | (radius >= 0.6))

@@ -14,12 +14,12 @@ from torchrl_etl.extras import extra
 
 __all__ = ["Interval", "interval", "success_interval"]
 
-# Resamples drawn at once: keeps the bootstrap of some 10,000 episodes within tens of megabytes.
+# Elements resampled at once, which limits the bootstrap of 10,000 episodes to tens of megabytes.
 _BATCH_ELEMENTS = 4_000_000
 
 
 class Interval(NamedTuple):
-    """A mean and the two ends of its confidence interval."""
+    """A mean and the bounds of its confidence interval."""
 
     mean: float
     low: float
@@ -29,16 +29,16 @@ class Interval(NamedTuple):
 def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
     """Mean of ``values`` with a bootstrap confidence interval.
 
-    The interval is bias-corrected and accelerated (BCa). Where that is undefined, as for constant
-    data, it is the percentile interval. Booleans are outcomes, so they go to
-    :func:`success_interval`. The resampling is seeded: the same values give the same interval.
+    The interval is bias-corrected and accelerated (BCa), or the percentile interval if BCa is
+    undefined, as for constant data. Booleans are passed to :func:`success_interval`. Resampling
+    is seeded: the same values give the same interval.
 
     Args:
         values (array-like): independent numbers, such as one return per seed.
         confidence (float): in (0, 1). Default: 0.95.
 
     Returns:
-        Interval: mean, low, high. One value alone says nothing about its spread: its ends are NaN.
+        Interval: mean, low, high. For a single value, low and high are NaN.
 
     Raises:
         ValueError: if there are no values, one is not finite, or the confidence is outside (0, 1).
@@ -67,7 +67,7 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
         from scipy.stats import DegenerateDataWarning, bootstrap
     for method in ("BCa", "percentile"):
         with warnings.catch_warnings():
-            # A degenerate BCa divides zero by zero on its way to the NaN that is handled below.
+            # A degenerate BCa divides zero by zero; the resulting NaN is handled below.
             warnings.simplefilter("ignore", DegenerateDataWarning)
             warnings.simplefilter("ignore", RuntimeWarning)
             ends = bootstrap(
@@ -86,10 +86,10 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
 def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.95) -> Interval:
     """Share of solved episodes with its Wilson score interval.
 
-    Unlike a bootstrap, it keeps a sensible width when every episode was solved, or none was.
+    Unlike a bootstrap interval, it has a sensible width if all episodes or none were solved.
 
     Args:
-        solved (sequence of bool): one outcome per episode; numbers 0 and 1 will do.
+        solved (sequence of bool): one outcome per episode, also as 0 and 1.
         confidence (float): in (0, 1). Default: 0.95.
 
     Raises:

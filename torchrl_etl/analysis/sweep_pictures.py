@@ -1,7 +1,7 @@
-"""Pictures of a sweep: learning curves of a task beside published ones, and methods over all tasks.
+"""Plots of a sweep: learning curves per task with published ones, and methods over all tasks.
 
-Every function draws into a PNG at ``path`` and returns the path. A method has one colour, marker
-and line style in all pictures that are drawn with the same :func:`looks`.
+Every function writes a PNG to ``path`` and returns the path. A method has the same colour, marker
+and line style in all plots drawn with the same :func:`looks`.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
 __all__ = ["looks", "overall_picture", "task_picture"]
 
-# Column, metric of the published curves, title of the axis, factor to the axis' unit.
+# Column, metric of the published curves, axis label, factor to the unit of the axis.
 _PANELS = (
     ("mean_return", "return", "return per episode", 1.0),
     ("solved", "success", "solved episodes [%]", 100.0),
 )
 
-# The last colour of the series is grey, which here belongs to the published curves; with black
-# instead there is one for each of seven methods.
+# Grey, the last colour of the series, is reserved for published curves. Black replaces it as the
+# seventh colour.
 _COLORS = (*SERIES[:-1], "#000000")
 _LINES = ("-", "-.", (0, (5, 1.5, 1, 1.5, 1, 1.5)))
 _GREYS = ("0.35", "0.55", "0.7")
-# By name, so that one algorithm looks the same on every task and panel.
+# Fixed order, so that an algorithm looks the same on every task and panel.
 _PUBLISHED = ("FlashSAC", "SimbaV2", "XQC", "TD-MPC2", "MR.Q", "PPO")
 
 
 def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour, marker and line style for each method; distinct for up to twenty-one.
+    """Colour, marker and line style for each method, distinct for up to 21 methods.
 
     Examples:
         >>> styles = looks(["sac", "etl"])
@@ -68,12 +68,12 @@ def task_picture(
     budget: int | None = None,
     repetitions: int = 2000,
 ) -> Path:
-    """Draw return, and success where it is known, against environment frames.
+    """Plot return, and success if known, against environment frames.
 
-    A line is the mean over the seeds of a method, over the frames that all of them reached. Its
-    band is the 95 % bootstrap interval from three seeds up, smallest to largest of two. Published
-    curves are grey and dashed, up to the frames that the runs reached. ``budget`` marks the frames
-    at which methods are compared; ``repetitions`` are bootstrap resamples.
+    Lines are means over the seeds of a method, on the frames that all of them reached. Bands are
+    95 % bootstrap intervals for three or more seeds, and the range for two. Published curves are
+    grey and dashed, up to the frames that the runs reached. ``budget`` marks the frames at which
+    methods are compared; ``repetitions`` is the number of bootstrap resamples.
 
     Raises:
         ValueError: if there are no runs.
@@ -117,13 +117,13 @@ def task_picture(
     figure.suptitle("{} ({} goal)".format(*runs[0].setting))
     caption = _caption(env_id, notes, end)
     lines = textwrap.fill(caption, int(16 * figure.get_figwidth()), break_on_hyphens=False)
-    # supxlabel, unlike a free text, is given room by the layout.
+    # The layout makes room for supxlabel, but not for free text.
     figure.supxlabel(lines, x=0.01, ha="left", fontsize=8, color="0.35", linespacing=1.3)
     return write(figure, path)
 
 
 def _caption(env_id: str, notes: Sequence[str], end: int) -> str:
-    """What the lines mean, and where published curves are what to know of them."""
+    """Explanation of lines and bands, with caveats if published curves are shown."""
     caption = "Line: mean over seeds (n). Band: 95 % bootstrap interval; of two seeds, their range."
     known = (*published_curves(env_id), *published_curves(env_id, "success"))
     begin = min((curve.frames[0] for curve in known), default=None)
@@ -139,7 +139,7 @@ def overall_picture(
     styles: Mapping[str, Mapping[str, Any]],
     path: str | os.PathLike[str],
 ) -> Path:
-    """Draw each method's interquartile mean of normalized returns with its interval.
+    """Plot each method's interquartile mean of normalized returns with its interval.
 
     Raises:
         ValueError: if there are no results.
@@ -192,7 +192,7 @@ def _draw_method(
     if not lines:
         return
     frames = np.unique(np.concatenate([line[0] for line in lines]))
-    # Only where no seed has to be extrapolated.
+    # No extrapolation beyond any seed's frames.
     start, stop = max(line[0, 0] for line in lines), min(line[0, -1] for line in lines)
     frames = frames[(frames >= start) & (frames <= stop)]
     label = f"{runs[0].method} ({len(runs)})"
@@ -211,8 +211,8 @@ def _draw_method(
 def _draw_published(
     axes: Axes, curves: Sequence[PublishedCurve], end: float, unit: float
 ) -> list[str]:
-    """Draw the published curves up to ``end``; returns what the picture cannot show."""
-    # A failed run may be published at a tenth of everybody's return: it must not flatten the rest.
+    """Plot published curves up to ``end``; returns a note on points below the axis."""
+    # A failed published run, far below all others, must not flatten the plot.
     low, high = axes.get_ylim()
     floor = low - 0.75 * (high - low)
     below = []
@@ -225,7 +225,7 @@ def _draw_published(
         hidden = near[near[:, 1] < floor]
         below += [f"{curve.algorithm} at {f:,.0f} frames ({v:,.0f})" for f, v in hidden]
         index = _PUBLISHED.index(curve.algorithm)
-        # The points beyond the end give the line its slope; the axis cuts it.
+        # Points beyond the end are needed for the slope; the axis clips the line.
         axes.plot(
             *points.T,
             color=_GREYS[index % len(_GREYS)],
@@ -243,5 +243,5 @@ def _draw_published(
 
 
 def _reach(end: float) -> float:
-    """Where the axis of frames ends: room for the markers at the last evaluation."""
+    """Upper limit of the frames axis, with room for the markers of the last evaluation."""
     return max(1.0, 1.04 * end)

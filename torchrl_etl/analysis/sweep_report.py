@@ -49,9 +49,9 @@ def write_report(
     frames: int | None = None,
     repetitions: int = 2000,
 ) -> tuple[int, int]:
-    """Write report.md and its pictures into a folder; returns how many tasks and methods are in it.
+    """Write report.md and its plots into a folder; returns the numbers of tasks and methods.
 
-    ``arguments`` are the settings that led to it, to be named in it; the others are those of
+    ``arguments`` are the command-line settings, quoted in the report. Other arguments as for
     :func:`~torchrl_etl.analysis.sweep_statistics.compare`.
 
     Raises:
@@ -89,7 +89,7 @@ def write_report(
 
 
 def _methods(sweep: SweepResults, control: str) -> list[str]:
-    """The methods that finished a run, the control first."""
+    """Methods with a finished run, the control first."""
     if not sweep.finished:
         raise ValueError(f"None of the {len(sweep.runs)} runs finished: nothing to report.")
     methods = sorted({run.method for run in sweep.finished})
@@ -225,7 +225,7 @@ def _unfinished(sweep: SweepResults) -> list[str]:
 
 
 def _origins(sweep: SweepResults) -> list[str]:
-    """Commits, machines and versions of the finished runs, with how many runs each has."""
+    """Commits, machines and versions of the finished runs, with the number of runs of each."""
     commits, machines, versions = Counter(), Counter(), Counter()
     mixed = []
     for run in sweep.finished:
@@ -257,7 +257,7 @@ def _interval(interval: Interval, number=lambda value: f"{value:.3f}") -> tuple[
 
 
 def _plain(value: float) -> str:
-    """A return with as many digits as it can bear: 2,212 or 68.3 or 0.123."""
+    """A return with a suitable number of digits: 2,212 or 68.3 or 0.123."""
     digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 10 else 3
     return f"{value:,.{digits}f}"
 
@@ -284,7 +284,7 @@ def _picture(setting: tuple[str, str]) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    # A bar inside a cell, as in a status or a machine's name, would end the cell.
+    # A bar within a cell, as in a status or a machine's name, would end the cell.
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     lines = [header, ["---"] * len(header), *cells]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -21,18 +21,18 @@ RESULTS = "results.csv"
 
 
 class SweepRow(NamedTuple):
-    """One evaluation; numbers that the file leaves empty are NaN.
+    """One evaluation; numbers that are empty in the file are NaN.
 
     Attributes:
-        line: Where the file says so.
-        task, goal, method, seed: Which run it belongs to.
-        frames: Environment frames until then, exploration charged.
+        line: Line number in the file.
+        task, goal, method, seed: The run.
+        frames: Environment frames so far, including exploration.
         mean_return: Mean undiscounted return over the evaluation's episodes.
-        solved, solved_time: Shares in [0, 1] of episodes and of steps that were solved.
+        solved, solved_time: Shares in [0, 1] of solved episodes and solved steps.
         episodes: Number of episodes.
         wall_seconds: Seconds since the run began.
-        commit, versions, machine: What produced the numbers.
-        status: ``"finished"``, or what became of the run.
+        commit, versions, machine: Origin of the numbers.
+        status: ``"finished"``, or another status of the run.
     """
 
     line: int
@@ -76,7 +76,7 @@ class SweepRun:
 
     @property
     def status(self) -> str:
-        """That of the newest row."""
+        """Status of the newest row."""
         return max(self.rows, key=lambda row: row.line).status
 
     @property
@@ -90,12 +90,12 @@ class SweepRun:
     def at(self, frames: int) -> SweepRow | None:
         """The last evaluation up to 1 % past ``frames``.
 
-        A run ends with the batch that reaches its budget.
+        Runs end with a whole batch, so slightly past their budget.
         """
         return next((row for row in reversed(self.rows) if row.frames <= 1.01 * frames), None)
 
     def curve(self, column: str) -> np.ndarray:
-        """Frames and values of a column, [2, T], without the rows where it is missing."""
+        """Frames and values of a column, [2, T], without missing values."""
         pairs = [(row.frames, getattr(row, column)) for row in self.rows]
         known = [pair for pair in pairs if math.isfinite(pair[1])]
         return np.array(known, float).reshape(-1, 2).T
@@ -107,12 +107,12 @@ class SweepRun:
 
 @dataclass(frozen=True)
 class SweepResults:
-    """What one file of evaluations holds.
+    """Content of one file of evaluations.
 
     Attributes:
-        runs: All runs, unfinished ones too.
+        runs: All runs, including unfinished ones.
         row_count: Number of rows in the file.
-        replaced: Number of rows that a repeated run made obsolete.
+        replaced: Number of rows superseded by a repeated run.
     """
 
     runs: tuple[SweepRun, ...]
@@ -129,7 +129,7 @@ class SweepResults:
 
     @property
     def settings(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of task and goal: the paper's tasks in their order, then others by name."""
+        """Pairs of task and goal: the paper's tasks in the paper's order, then others by name."""
         order = {task.name: index for index, task in enumerate(list_tasks())}
         found = {run.setting for run in self.runs}
         return tuple(sorted(found, key=lambda pair: (order.get(pair[0], len(order)), *pair)))
@@ -138,14 +138,14 @@ class SweepResults:
 def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
     """Read ``results.csv`` of a sweep's folder.
 
-    A run may have been repeated. Of rows with the same task, goal, method, seed and frames, the
-    one that stands latest in the file counts; and where rows were replaced, so were those of the
-    older attempt at more frames than the newer one reached.
+    A run may have been repeated. Among rows with the same task, goal, method, seed and frames, the
+    last one in the file counts. If a run has such repeated rows, its rows beyond the frames of its
+    last row are dropped as well.
 
     Raises:
         FileNotFoundError: if the folder or the file is missing.
-        ValueError: if the file has no rows, lacks columns, or a line has a number that cannot be
-            read; or a finished run has an evaluation without a return.
+        ValueError: if the file has no rows, lacks columns or has an invalid line, or if an
+            evaluation of a finished run has no return.
     """
     folder = Path(folder)
     path = folder / RESULTS

@@ -1,4 +1,4 @@
-"""What a sweep's runs say at an equal number of frames, task by task and over all tasks."""
+"""Comparison of a sweep's methods at equal frames, per task and over all tasks."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ __all__ = [
     "overall",
 ]
 
-# An evaluation so far below the budget, as a share of it, still stands for the budget: episodes
-# end at will, so evaluations fall on slightly different frames.
+# Relative tolerance for evaluations before the budget. Episodes of varying length put evaluations
+# at slightly different frames.
 _TOLERANCE = 0.05
 
 
@@ -33,8 +33,8 @@ _TOLERANCE = 0.05
 class MethodResult:
     """One method on one task at the budget; arrays have one number per run, in order of seeds.
 
-    ``frames_to_control`` are those at which the mean over its seeds is for the first time what the
-    control's is at the budget; ``None`` if it never is, or if there is no control.
+    ``frames_to_control`` are the frames at which its mean return first reaches the control's at
+    the budget; ``None`` if it never does, or if there is no control.
     """
 
     method: str
@@ -55,12 +55,12 @@ class Comparison:
 
     Attributes:
         setting: Task and goal.
-        budget: Environment frames that every run here was given.
+        budget: Environment frames at which methods are compared.
         results: One per method, in the order of the methods.
         untrained: Mean return of the evaluations at ``untrained_frames``, over all runs.
-        untrained_frames: The smallest number of frames at which a run was evaluated; mostly 0.
+        untrained_frames: The smallest number of frames at which a run was evaluated; usually 0.
         short: Runs left out because they ended before the budget.
-        stale: Runs whose last evaluation within the budget is more than 5 % below it.
+        stale: Runs whose last evaluation within the budget is more than 5 % before it.
     """
 
     setting: tuple[str, str]
@@ -78,7 +78,7 @@ class Comparison:
 def common_budget(runs: Sequence[SweepRun]) -> int:
     """The largest number of frames at which all runs can be compared.
 
-    No run ends before it; and if possible every run has an evaluation that stands for it.
+    No run ends before it. If possible, every run has an evaluation at most 5 % before it.
 
     Raises:
         ValueError: if there are no runs.
@@ -101,12 +101,12 @@ def compare(
 ) -> Comparison:
     """Compare the methods on one task at the same number of frames.
 
-    A run counts with its last evaluation up to 1 % past that number: nothing is interpolated.
-    Without ``frames`` it is the largest that the runs share. Improvement is over ``control``;
-    ``repetitions`` are bootstrap resamples.
+    Each run is represented by its last evaluation up to 1 % past that number, without
+    interpolation. ``frames`` defaults to :func:`common_budget`. Improvement is over ``control``;
+    ``repetitions`` is the number of bootstrap resamples.
 
     Raises:
-        ValueError: if there are no runs, or they are of several tasks.
+        ValueError: if there are no runs, or they are from several tasks.
     """
     if len({run.setting for run in runs}) != 1:
         raise ValueError("Compare the finished runs of one task and goal; pass no others.")
@@ -132,7 +132,7 @@ def compare(
 
 
 class Scale(NamedTuple):
-    """Zero and one of a task's normalized return, and whose return the one is."""
+    """Returns normalized to zero and one on a task, and the source of the latter."""
 
     zero: float
     one: float
@@ -140,10 +140,10 @@ class Scale(NamedTuple):
 
 
 def normalize(comparison: Comparison, control: str) -> Scale | str:
-    """The scale on which a task's returns are averaged with other tasks', or why there is none.
+    """The scale for averaging a task's returns with other tasks', or the reason for having none.
 
-    Zero is the return of the untrained policies, so negative returns do no harm. One is the best
-    published return at the same frames; the control's mean where nothing was published.
+    Zero is the return of the untrained policies, so negative returns are possible. One is the best
+    published return at the same frames, or the control's mean if nothing was published.
 
     Equation:
         (x − zero)/(one − zero)
@@ -163,7 +163,7 @@ def normalize(comparison: Comparison, control: str) -> Scale | str:
 
 @dataclass(frozen=True)
 class OverallResult:
-    """One method over the tasks that it has; ``control_iqm`` is the control's on the same tasks."""
+    """One method over all of its tasks; ``control_iqm`` is the control's IQM on the same tasks."""
 
     method: str
     settings: tuple[tuple[str, str], ...]
@@ -183,8 +183,8 @@ def overall(
 ) -> tuple[OverallResult, ...]:
     """Aggregate each method's normalized returns over the tasks that have a scale.
 
-    There is one comparison per task, and for each what :func:`normalize` said of its scale; the
-    other arguments are those of :func:`compare`.
+    ``comparisons`` has one entry per task, and ``scales`` the result of :func:`normalize` for each.
+    Other arguments as for :func:`compare`.
     """
     scaled = [
         (comparison, scale)
@@ -245,7 +245,7 @@ def _result(
 
 
 def _first_at(runs: Sequence[SweepRun], target: float, budget: int) -> int | None:
-    """The first evaluation within the budget at which the mean over runs is at the target."""
+    """Frames of the first evaluation within the budget where the runs' mean reaches the target."""
     begun = max(run.rows[0].frames for run in runs)
     end = max(run.at(budget).frames for run in runs)
     evaluated = {row.frames for run in runs for row in run.rows if begun <= row.frames <= end}

@@ -1,4 +1,4 @@
-"""What stage 1 found: numbers, warnings in words, and pictures."""
+"""Report on the synergies of stage 1: numbers, warnings and plots."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["describe_synergies", "draw_synergies"]
 def describe_synergies(
     model: SynergyModel, decoder: SynergyMap, actions: Tensor
 ) -> tuple[dict[str, Any], list[str]]:
-    """Numbers of a synergy space on the actions [N, n] it was fitted to, and its warnings.
+    """Metrics of a synergy space on the actions [N, n] it was fitted to, and its warnings.
 
     Returns:
-        dict: ``vaf``, ``pca_vaf`` and ``nmf_vaf`` at the same d, ``control_authority`` (mean share
-        of an actuator's range that the decoder commands), and what the model adds: see
+        dict: ``vaf``, ``pca_vaf`` and ``nmf_vaf`` at the same d, ``control_authority`` (mean over
+        actuators), and the metrics of
         :meth:`SynergyModel.describe <torchrl_etl.synergies.SynergyModel.describe>`.
-        list of str: what is wrong with it, in words.
+        list of str: warnings, as sentences.
     """
     authority = control_authority(decoder)
     vaf = variance_accounted_for(actions, model.reconstruct(actions))
@@ -55,19 +55,18 @@ def draw_synergies(
     dims: Sequence[int],
     on_update: Callable[[], None] = lambda: None,
 ) -> None:
-    """Heat map over named muscles, and VAF against d beside PCA and NMF.
+    """Plot a heat map of the synergies, and VAF against d in comparison with PCA and NMF.
 
     Args:
-        make_model (callable): a fresh synergy model with so many synergies.
-        decoder (SynergyMap): the decoder that was found.
-        actions (Tensor): what it was fitted to [N, n].
-        names (sequence of str): actuators, in action order.
-        folder (path): where the PNGs go.
+        make_model (callable): makes a new synergy model with the given number of synergies.
+        decoder (SynergyMap): decoder of the fitted model.
+        actions (Tensor): actions that the model was fitted to [N, n].
+        names (sequence of str): names of the actuators, in action order.
+        folder (path): folder of the PNGs.
 
     Keyword Args:
         dims (sequence of int): numbers of synergies on the VAF curve; those above n are left out.
-            A fresh model is fitted at every d, so that the curve compares dimensions and not
-            training times.
+            A new model is fitted for every d, so that all have the same training time.
         on_update (callable): called before every update; may raise to stop.
     """
     synergy_heatmap(decoder, names, folder / "synergies.png")

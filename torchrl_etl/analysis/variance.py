@@ -1,4 +1,4 @@
-"""How much of the actions' variance synergies account for: a model's, PCA's and NMF's."""
+"""Variance of actions accounted for by a synergy model, PCA and NMF."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def variance_accounted_for(
 ) -> float:
     """Variance accounted for: 1 − Σ‖a − â‖² / Σ‖a − ā‖², with ā the mean action.
 
-    1 is a perfect reconstruction, 0 is no better than always answering the mean action, and less
-    than 0 is worse than that. Constant actions have no variance to account for: the result is then
-    1 if they are reconstructed to rounding error, else 0.
+    1 is a perfect reconstruction, 0 is as good as the mean action, and negative values are worse.
+    For constant actions, which have no variance, the result is 1 if they are reconstructed up to
+    rounding error, otherwise 0.
 
     Args:
         actions (Tensor or array): actions [*, n].
         reconstruction (Tensor or array): their reconstructions, of the same shape.
 
     Keyword Args:
-        mean (Tensor or array, optional): ā [n], of more actions than these. Default: their own.
+        mean (Tensor or array, optional): ā [n], for example of a larger set. Default: their mean.
 
     Raises:
         ValueError: if the shapes differ, there are no actions, or a number is not finite.
@@ -48,8 +48,8 @@ def variance_accounted_for(
     missed = float(np.square(actions - reconstruction).sum())
     center = actions.mean(0) if mean is None else as_array(mean)
     total = float(np.square(actions - center).sum())
-    # Rounding leaves a constant column a variance of some (1e-16)² relative to its size, and
-    # float32 data a residual of (1e-7)².
+    # Rounding gives constant columns a relative variance of about (1e-16)², and float32 data a
+    # relative residual of about (1e-7)².
     size = float(np.square(actions).sum())
     if total <= 1e-24 * size:
         return 1.0 if missed <= 1e-12 * size else 0.0
@@ -57,16 +57,16 @@ def variance_accounted_for(
 
 
 def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int = 50_000) -> float:
-    """Variance that the best ``num_synergies`` linear directions account for.
+    """Variance accounted for by ``num_synergies`` principal components.
 
-    No linear decoder with an offset can do better on these actions, so a nonlinear one should.
+    No affine decoder can do better on these actions; a nonlinear one should.
 
     Args:
         actions (Tensor or array): actions [*, n].
         num_synergies (int): number d of principal components.
 
     Keyword Args:
-        max_samples (int): more actions than this are subsampled, with a fixed seed.
+        max_samples (int): larger numbers of actions are subsampled, with a fixed seed.
 
     Raises:
         ValueError: if d exceeds the number of actuators or actions, or an action is not finite.
@@ -88,11 +88,11 @@ def nmf_vaf(
     *,
     max_samples: int = 5_000,
 ) -> float:
-    """Variance that non-negative matrix factorisation with ``num_synergies`` parts accounts for.
+    """Variance accounted for by non-negative matrix factorization with ``num_synergies`` parts.
 
-    This is how motor control research extracts muscle synergies from recordings. It sees a − low,
-    which is never negative; the variance is still taken about the mean action, so the number
-    compares with the other two. NMF has no offset of its own: with few parts it can fall below 0.
+    NMF is the usual method to extract muscle synergies from recordings. It is fitted to a − low,
+    which is never negative. The variance is about the mean action, so that results compare with
+    those of other models. NMF has no offset, so with few parts the result can be negative.
 
     Args:
         actions (Tensor or array): actions [*, n].
@@ -100,7 +100,7 @@ def nmf_vaf(
         low (float, Tensor or array): lower action bound, one or [n]. Default: -1.
 
     Keyword Args:
-        max_samples (int): more actions than this are subsampled, with a fixed seed.
+        max_samples (int): larger numbers of actions are subsampled, with a fixed seed.
 
     Raises:
         ValueError: if an action is below ``low``, d exceeds the number of actuators or actions, or

@@ -1,7 +1,7 @@
-"""A body in the browser: its synergies under sliders, its policies at work.
+"""A viewer in the browser for a body, moved by its policies or by sliders for its synergies.
 
-``Page`` needs viser and is imported from ``torchrl_etl.analysis.viewer.page``; a session does
-without.
+Import ``Page``, which needs viser, from ``torchrl_etl.analysis.viewer.page``. A session works
+without viser.
 """
 
 from torchrl_etl.analysis.viewer.session import Driver, Session, Subject

@@ -33,13 +33,12 @@ _FREE_TENDON = np.array([150, 150, 150], np.uint8)
 
 
 class Body:
-    """Meshes, target sites and tendons of a model; :meth:`draw` puts them where the data says.
+    """Meshes, sites and tendons of a model; :meth:`draw` moves them to the state of the data.
 
-    mjviser bakes whatever does not move into the scene when it is built, and so the goals that
-    tasks move through the model; it draws all tendons in one colour. So its conversion of meshes is
-    used here, and not its scene.
+    This uses mjviser's mesh conversion, but not its scene. The latter fixes static parts when it is
+    built, including goals that tasks move through the model, and draws all tendons in one colour.
 
-    The server's scene is emptied first. ``follow`` keeps a body in the middle that walks away.
+    The server's scene is cleared first. ``follow`` keeps a moving body in the center.
     """
 
     def __init__(
@@ -53,9 +52,9 @@ class Body:
         self._server, self._model, self._data = server, model, data
         server.scene.reset()
         server.scene.set_up_direction("+z")
-        # An environment map doubles the time of a picture without a GPU; a lamp fills the shade.
+        # Without a GPU, an environment map doubles the time per frame; a lamp replaces it.
         server.scene.configure_environment_map(None)
-        server.scene.configure_default_lights(cast_shadow=False)  # dear there too
+        server.scene.configure_default_lights(cast_shadow=False)  # also slow without a GPU
         server.scene.add_light_directional("/lamp", position=(0.9, -1.0, -0.3), intensity=0.5)
         self._world = server.scene.add_frame("/world", show_axes=False)
         self._parts: list[tuple[Any, int]] = [*self._add_geoms()]
@@ -69,7 +68,7 @@ class Body:
         self.draw()
 
     def draw(self) -> None:
-        """Show the state that the data now has."""
+        """Show the current state of the data."""
         with self._server.atomic():
             if self._followed is not None:
                 self._ahead[:2] = -self._data.xpos[self._followed][:2]
@@ -112,7 +111,7 @@ class Body:
             yield self._add_flat(f"/world/site{site}", mesh, rgba[site]), site
 
     def _add_flat(self, name: str, mesh: trimesh.Trimesh, rgba: np.ndarray) -> Any:
-        """A mesh of one colour; only so is it translucent in the browser."""
+        """A mesh of a single colour, as the browser requires for transparency."""
         return self._server.scene.add_mesh_simple(
             name,
             mesh.vertices,
@@ -124,7 +123,7 @@ class Body:
     def _place(
         self, parts: list[tuple[Any, int]], places: np.ndarray, turns: np.ndarray, first: int
     ) -> None:
-        """Send what has moved."""
+        """Update the poses of parts that have moved."""
         if not parts:
             return
         index = [number for _, number in parts]
@@ -166,15 +165,15 @@ class Body:
         scales: np.ndarray,
         shades: np.ndarray,
     ) -> None:
-        """Many copies of one shape, [N, *] each.
+        """Show many copies of one shape, with arrays [N, *].
 
-        The browser draws them one picture later than what has a pose, so that a tendon in a world
-        that moves would be left behind: they are put beside that world, where it has moved to.
+        The browser updates these one frame later than the poses of nodes, so tendons below a moving
+        world frame would be displaced. They are placed outside it, shifted by its offset.
         """
         count, room = len(positions), self._room.get(name, 0)
         if not count:
             return
-        if count > room:  # more than is needed now, since tendons wrap and unwrap
+        if count > room:  # with spare capacity, since tendons wrap and unwrap
             room = self._room[name] = count + count // 4
             if name in self._shapes:
                 self._shapes.pop(name).remove()
@@ -212,17 +211,17 @@ class Body:
 
 
 def _rgba(model: mujoco.MjModel, kind: str) -> np.ndarray:
-    """Colours [N, 4] of geoms or sites, those of their materials where they have one."""
+    """Colours [N, 4] of geoms or sites; unset ones get the colour of their material, if any."""
     rgba = np.array(getattr(model, f"{kind}_rgba"))
     material = getattr(model, f"{kind}_matid")
-    default = (rgba == np.float32([0.5, 0.5, 0.5, 1.0])).all(1)  # what MuJoCo takes for unset
+    default = (rgba == np.float32([0.5, 0.5, 0.5, 1.0])).all(1)  # unset, by MuJoCo's convention
     from_material = (material >= 0) & default
     rgba[from_material] = model.mat_rgba[material[from_material]]
     return rgba
 
 
 def _from_z(directions: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] that turn the z axis into unit vectors [N, 3]."""
+    """Quaternions wxyz [N, 4] that rotate the z axis to unit vectors [N, 3]."""
     x, y, z = directions.T
     wxyz = np.stack([1.0 + z, -y, x, np.zeros_like(x)], 1)
     wxyz[z < -0.999999] = [0.0, 1.0, 0.0, 0.0]
@@ -230,7 +229,7 @@ def _from_z(directions: np.ndarray) -> np.ndarray:
 
 
 def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] of rotation matrices in rows [N, 9]."""
+    """Quaternions wxyz [N, 4] of flattened rotation matrices [N, 9]."""
     wxyz = np.empty((len(matrices), 4))
     for quaternion, matrix in zip(wxyz, matrices, strict=True):
         mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix, np.float64).reshape(9))

@@ -1,4 +1,4 @@
-"""What of a scene is the body's, and from where all of it is seen."""
+"""Visible geoms and extent of a body, for placing the camera."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ if TYPE_CHECKING:
 __all__ = ["SHOWN_GROUPS", "middle_and_size", "moving_bodies", "planes", "scenery", "seen"]
 
 SHOWN_GROUPS = 3
-"""MuJoCo draws groups 0 to 2 of geoms and sites, unless it is told otherwise."""
+"""By default, MuJoCo draws groups 0 to 2 of geoms and sites."""
 
 
 def planes(model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms [ngeom] are floors or other planes."""
-    import mujoco  # there, since its model is
+    """Mask [ngeom] of geoms that are planes, such as floors."""
+    import mujoco  # installed, since the model exists
 
     return model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 def scenery(model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms [ngeom] stand there for show alone, such as the walls of a room."""
+    """Mask [ngeom] of purely visual geoms of the world, such as the walls of a room."""
     touched = (model.geom_contype | model.geom_conaffinity) != 0
     return (model.geom_bodyid == 0) & ~touched & ~planes(model)
 
 
 def seen(model: mujoco.MjModel) -> np.ndarray:
-    """Which geoms [ngeom] the viewer draws: those MuJoCo would, and the bones under a skin.
+    """Mask [ngeom] of geoms to draw: those drawn by MuJoCo, and the bones under a skin.
 
-    The page cannot draw a skin, and a model that has one hides its meshes in a group of their own.
+    The viewer cannot draw skins, and a model with a skin hides its meshes in a separate group.
     """
     import mujoco
 
@@ -40,18 +40,18 @@ def seen(model: mujoco.MjModel) -> np.ndarray:
 
 
 def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
-    """Bodies that can move against the world, or are all there is."""
+    """Bodies that can move relative to the world, or all bodies if none can."""
     moving = np.flatnonzero(model.body_weldid != 0)
     return moving if len(moving) else np.arange(model.nbody)
 
 
 def middle_and_size(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Middle [3] of the moving bodies in the world, and how far apart they are, 0.1 or more.
+    """Center [3] of the bounding box of the moving bodies, and its diagonal, at least 0.1.
 
-    What is drawn of a body counts, not its origin alone: a torso of one piece has its head far off.
-    So do tendons, which reach to bones that do not move.
+    The box includes drawn geoms, which may reach far from a body's origin, and tendons, which
+    reach to bones that do not move.
     """
-    from torchrl_etl.analysis.viewer.muscles import paths  # there, since it needs MuJoCo
+    from torchrl_etl.analysis.viewer.muscles import paths  # imported here, since it needs MuJoCo
 
     bodies, path = moving_bodies(model), paths(model, data)
     places = [data.xpos[bodies], _corners(model, data, bodies), path.start, path.end]
@@ -61,7 +61,7 @@ def middle_and_size(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndar
 
 
 def _corners(model: mujoco.MjModel, data: mujoco.MjData, bodies: np.ndarray) -> np.ndarray:
-    """Corners [8 G, 3] of the boxes around what is drawn of bodies."""
+    """Corners [8 G, 3] of the bounding boxes of the bodies' drawn geoms."""
     geoms = np.isin(model.geom_bodyid, bodies) & seen(model)
     middle, half = np.split(model.geom_aabb[geoms], 2, axis=1)
     signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T

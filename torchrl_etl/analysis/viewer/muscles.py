@@ -1,4 +1,4 @@
-"""What muscles do, in numbers that a picture can show: strengths, activations, paths."""
+"""Muscle data for the viewer: strengths, activations, paths."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _WRAPPED_JOINT = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
-_LEAST = 0.01  # strength that is worth naming
-# Rest, half and full activation; and the same for what pulls the other way.
+_LEAST = 0.01  # smallest strength that is listed
+# Colours of rest, half and full activation, and of half and full negative activation.
 _REST, _HALF, _FULL = np.array([[60, 72, 102], [226, 74, 60], [216, 0, 32]], float)
 _HALF_BACK, _FULL_BACK = np.array([[67, 147, 195], [0, 92, 190]], float)
 
 
 def driven_muscles(decoder: SynergyMap, names: Sequence[str]) -> list[list[tuple[str, float]]]:
-    """Per synergy the muscles that it drives, by name and strength, the strongest first.
+    """Names and strengths of the muscles that each synergy drives, the strongest first.
 
-    Strengths are those of :func:`~torchrl_etl.analysis.synergy_effects`, in [-1, 1].
+    Strengths are from :func:`~torchrl_etl.analysis.synergy_effects`, in [-1, 1].
 
     Examples:
         >>> import torch
@@ -47,7 +47,7 @@ def driven_muscles(decoder: SynergyMap, names: Sequence[str]) -> list[list[tuple
 
 
 def activations(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """How active each actuator is [nu]: a muscle in [0, 1], a motor in [-1, 1] of its range."""
+    """Activation [nu]: in [0, 1] for muscles, relative control in [-1, 1] for motors."""
     stateful = (model.actuator_actnum == 1) & (
         model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_MUSCLE)
     )
@@ -58,7 +58,7 @@ def activations(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def colors(active: np.ndarray) -> np.ndarray:
-    """Colours [*, 3], uint8, of activations in [-1, 1]: from slate to red, or to blue below 0."""
+    """Colours [*, 3], uint8, of activations in [-1, 1]: slate at 0, red above and blue below."""
     size = np.abs(active)[..., None]
     half = np.where(active[..., None] < 0, _HALF_BACK, _HALF)
     full = np.where(active[..., None] < 0, _FULL_BACK, _FULL)
@@ -67,10 +67,10 @@ def colors(active: np.ndarray) -> np.ndarray:
 
 
 class Path(NamedTuple):
-    """Straight pieces that actuators are drawn as.
+    """Line segments for drawing actuators.
 
-    ``start`` and ``end`` [P, 3] are in the world; ``actuator`` [P] says whose colour a piece has,
-    -1 for a tendon that nothing pulls. A piece of no length is a joint that a motor turns.
+    ``start`` and ``end`` [P, 3] are world coordinates. ``actuator`` [P] is the index of the
+    actuator, -1 for a tendon without one. A segment of zero length is a joint turned by a motor.
     """
 
     start: np.ndarray
@@ -79,7 +79,7 @@ class Path(NamedTuple):
 
 
 def paths(model: mujoco.MjModel, data: mujoco.MjData) -> Path:
-    """Where tendons run now, around what they wrap; joints for what pulls at no tendon."""
+    """Current tendon paths with their wrapping, and the joints of actuators without a path."""
     start, end, owner = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, int)]
     points, objects = data.wrap_xpos.reshape(-1, 3), data.wrap_obj.reshape(-1)
     pulled = pulled_tendons(model)
@@ -98,7 +98,7 @@ def paths(model: mujoco.MjModel, data: mujoco.MjData) -> Path:
 
 
 def pulled_tendons(model: mujoco.MjModel) -> dict[int, int]:
-    """By tendon, the actuator that pulls it."""
+    """Tendons to the actuators that pull them."""
     return {
         int(model.actuator_trnid[i, 0]): i
         for i in range(model.nu)
@@ -107,7 +107,7 @@ def pulled_tendons(model: mujoco.MjModel) -> dict[int, int]:
 
 
 def turned_joints(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Joints that actuators turn without a path through space, and by which actuator, [J] each."""
+    """Joints turned by actuators without a spatial path, and these actuators, [J] each."""
     pairs = []
     for actuator in range(model.nu):
         kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])

@@ -1,4 +1,4 @@
-"""The page in the browser: buttons and sliders on a session, beside its body."""
+"""The page in the browser: a session's body, with buttons and sliders."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ with extra("viewer"):
 
 __all__ = ["Page", "check_port"]
 
-_FRAME = 1 / 30  # seconds between pictures
-_REFRESH = 0.1  # seconds between updates of numbers
+_FRAME = 1 / 30  # seconds between frames
+_REFRESH = 0.1  # seconds between updates of the numbers
 _SPEEDS = ("1/8x", "1/4x", "1/2x", "1x", "2x", "4x")
 _NAMES = {"policy": "Trained policy", "sliders": "Sliders", "explorer": "Stage 1's policy"}
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise a ``ValueError`` unless a server can listen there; viser would quietly take another."""
-    if not isinstance(host, str) or not host:  # an empty one would let everyone in
+    """Raise a ``ValueError`` if the port cannot be used; viser would silently use another."""
+    if not isinstance(host, str) or not host:  # an empty host would listen on all interfaces
         raise ValueError(
             f"host is {host!r}; it must be an address to listen on, such as 127.0.0.1 (for this "
             "machine alone) or 0.0.0.0 (for whoever reaches it)."
@@ -58,18 +58,18 @@ def check_port(host: str, port: int) -> None:
 
 
 class Page:
-    """Serves a session; all of it happens in the thread that calls :meth:`run` or :meth:`tick`.
+    """Serves a session, entirely in the thread that calls :meth:`run` or :meth:`tick`.
 
     Args:
-        session (Session): what is looked at.
+        session (Session): the session to show.
 
     Keyword Args:
-        host (str): address to listen on. Default: this machine alone.
-        port (int): 0 takes any that is free.
-        say (callable): where messages for a person go, one line each.
+        host (str): address to listen on. Default: ``"127.0.0.1"``, only this machine.
+        port (int): port to listen on; 0 takes any free one. Default: 8080.
+        say (callable): receives messages for the user, one line each.
 
     Raises:
-        ValueError: if nothing can listen there, or the session has no body to draw.
+        ValueError: if host or port cannot be used, or the session has no body to draw.
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class Page:
         check_port(host, port)
         self.session, self._say = session, say
         self._commands: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser announces itself
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self.server = viser.ViserServer(host, port, label="torchrl_etl", verbose=False)
         self.port = self.server.get_port()
         self.address = f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
         self._shown_at = self._refreshed_at = 0.0
         self._dirty = True
         gui = self.server.gui
-        # Sharing would send the page through a server of viser's.
+        # Sharing would send the page through viser's server.
         gui.configure_theme(show_logo=False, show_share_button=False)
         self._controls: dict[str, Any] = {}
         self._sliders: list[Any] = []
@@ -106,7 +106,7 @@ class Page:
         self.server.on_client_disconnect(lambda client: self._commands.put(self._browser_left))
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Serve until told so or interrupted."""
+        """Serve until ``until()`` is true, or an interrupt."""
         last = time.monotonic()
         try:
             while not until():
@@ -118,7 +118,7 @@ class Page:
             self.close()
 
     def tick(self, seconds: float) -> None:
-        """Do what was clicked, let so much time pass, and show what became of it."""
+        """Execute user commands, advance the session by ``seconds``, and update the page."""
         self._obey()
         try:
             self._dirty |= self.session.advance(seconds) > 0
@@ -138,7 +138,7 @@ class Page:
             self.server.stop()
         self.session.close()
 
-    # Commands: callbacks run in viser's threads and only leave word -----------------------------
+    # Commands: callbacks run in viser's threads and only queue them -----------------------------
 
     def _obey(self) -> None:
         while True:
@@ -153,7 +153,7 @@ class Page:
             self._dirty = self._stale = True
 
     def _when(self, handle: Any, command: Callable[[Any], Any]) -> Any:
-        """Have the command called with the handle's value when a person, not we, changed it."""
+        """Queue the command with the handle's value when the user changes it, not the program."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
@@ -219,7 +219,7 @@ class Page:
 
         hint = "Along which stage 1's policy explores"
         direction = self._when(gui.add_dropdown("Direction", [*axes, "random"], hint=hint), choose)
-        # A menu tells of a change alone, so it would draw only once.
+        # A menu only reports changes, so choosing "random" again would draw nothing.
         self._when(gui.add_button("Draw a direction"), lambda _: choose("random"))
 
     def _add_synergies(self) -> None:
@@ -263,7 +263,7 @@ class Page:
         self._stale = True
 
     def _refresh(self) -> None:
-        """Bring the numbers and sliders up to date."""
+        """Update the numbers and sliders."""
         session, controls = self.session, self._controls
         controls["status"].content = status(session)
         active = activations(session.model, session.data)
@@ -272,12 +272,12 @@ class Page:
             controls["activation"].content = activation_grid(names, active)
         controls["driver"].value = _NAMES[session.driver]
         controls["episode"].value = session.episode
-        if "goal" in controls:  # one that could not be built is not the session's
+        if "goal" in controls:  # reverts a goal that could not be built
             controls["goal"].value = session.goal
         controls["play"].label = "Pause" if session.playing else "Play"
         icon = viser.Icon.PLAYER_PAUSE if session.playing else viser.Icon.PLAYER_PLAY
         controls["play"].icon = icon
-        if self._commands.empty():  # or a hand on a slider is ahead of us
+        if self._commands.empty():  # otherwise the user is moving a slider
             for slider, value in zip(self._sliders, session.coefficients.tolist(), strict=True):
                 slider.value = round(value, 2)
 

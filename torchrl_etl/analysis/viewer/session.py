@@ -1,6 +1,6 @@
-"""One body that is looked at: who moves it, how fast, and what comes of it. No window, no browser.
+"""Viewer state without a browser: what moves the body, how fast, and the results.
 
-The viewer's page is buttons on a :class:`Session`; whatever they do can be done, and tested, here.
+All controls of the viewer's page call a :class:`Session`, so they can be used and tested here.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ __all__ = ["Driver", "Session", "Subject"]
 Driver = Literal["policy", "sliders", "explorer"]
 
 _SETTLING = 0.6
-"""Simulated seconds that a paused body is given to follow a slider."""
+"""Simulated seconds for which a paused body follows a slider."""
 _STEP = 0.02
-"""Seconds that a step of an environment without a clock is taken for."""
+"""Assumed duration in seconds of a step without a simulation clock."""
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What there is to look at: a task, and whatever can move its body.
+    """A task, and everything that can move its body.
 
     Args:
-        name (str): what a person calls it, such as the run folder.
-        task (Task): the task, its goal included.
-        make_env (callable): makes a single simulator of the task with the goal that it is given.
+        name (str): name for messages, such as the run folder.
+        task (Task): the task, with its goal.
+        make_env (callable): makes a single simulator of the task for a given goal.
         actuators (sequence of str): names of the n actuators, in action order.
 
     Keyword Args:
-        decoder (SynergyMap, optional): synergy coefficients to actions.
+        decoder (SynergyMap, optional): maps synergy coefficients to actions.
         policy (TensorDictModuleBase, optional): the policy that learned the task.
         explorer (TensorDictModuleBase, optional): stage 1's policy.
-        direction_dim (int): size of the direction that ``explorer`` reads; 0: it reads none.
-        episode_steps (int, optional): steps after which an episode is over even if the environment
-            does not say so.
+        direction_dim (int): size of the direction that ``explorer`` reads, 0 for none.
+        episode_steps (int, optional): step limit of an episode, if the environment does not
+            truncate earlier.
         first_seed (int): seed of episode 0.
     """
 
@@ -64,31 +64,31 @@ class Subject:
 
     @property
     def drivers(self) -> list[Driver]:
-        """What can move the body, the most telling first."""
+        """Available drivers; the first is the default."""
         there = {"policy": self.policy, "sliders": self.decoder, "explorer": self.explorer}
         return [name for name, part in there.items() if part is not None]
 
 
 class Session:
-    """Steps a subject's simulator under a policy, a hand on the sliders, or stage 1's policy.
+    """Steps a subject's simulator under its policy, sliders for its synergies, or stage 1's policy.
 
     Args:
-        subject (Subject): what is looked at.
+        subject (Subject): the subject to show.
 
     Attributes:
-        driver (str): who moves the body: ``"policy"``, ``"sliders"`` or ``"explorer"``.
-        coefficients (Tensor): of the sliders, or those that the policy emitted last [d].
+        driver (str): what moves the body: ``"policy"``, ``"sliders"`` or ``"explorer"``.
+        coefficients (Tensor): synergy coefficients from the sliders, or last policy output [d].
         direction (Tensor): unit vector that stage 1's policy follows [k].
-        residual (bool): whether the policy's residual reaches the muscles.
-        hold (bool): whether the sliders move a body whose free root is held in place.
-        playing (bool), speed (float): whether time goes on by itself, and how fast.
-        episode (int): number of the episode; its seed is the subject's first plus this.
-        steps, total_reward, solved_steps: of the episode so far.
-        solved (bool or None): whether the last step was solved; None if the task does not say.
-        over (bool): whether the episode has ended; :meth:`step` then begins the next one.
+        residual (bool): whether the policy's residual is applied.
+        hold (bool): whether the body's free root is held in place while the sliders drive.
+        playing (bool), speed (float): whether time advances, and how fast.
+        episode (int): number of the episode; its seed is ``subject.first_seed`` plus this.
+        steps, total_reward, solved_steps: totals of the current episode.
+        solved (bool or None): whether the last step was solved; None if the task does not tell.
+        over (bool): whether the episode has ended, see :meth:`step`.
 
     Raises:
-        ValueError: if nothing can move the body.
+        ValueError: if the subject has no drivers.
 
     Examples:
         >>> import torch
@@ -134,13 +134,13 @@ class Session:
             self.root = HeldJoints(self.model, self.data, root_joints(self.model, self.data))
         self.reset()
 
-    # What a person does ------------------------------------------------------------------------
+    # User commands -----------------------------------------------------------------------------
 
     def drive(self, driver: Driver) -> None:
-        """Let another one move the body from here on.
+        """Select the driver.
 
         Raises:
-            ValueError: if there is no such driver.
+            ValueError: if the subject has no such driver.
         """
         check_choice("driver", driver, self.subject.drivers)
         self.driver = driver
@@ -148,7 +148,7 @@ class Session:
             self.root.remember()
 
     def move(self, synergy: int, value: float) -> None:
-        """Set one coefficient in [-1, 1]; the sliders drive now, and a paused body follows."""
+        """Set one coefficient in [-1, 1] and let the sliders drive, even if paused."""
         self.drive("sliders")
         check_real("[-1, 1]", coefficient=value)
         self.coefficients = self.coefficients.clone()
@@ -161,10 +161,10 @@ class Session:
             self.move(synergy, 0.0)
 
     def follow(self, direction: Tensor) -> None:
-        """Let stage 1's policy follow a direction [k], brought to unit length.
+        """Let stage 1's policy drive along a direction [k], which is normalized.
 
         Raises:
-            ValueError: if it has another size than the policy's directions, or is zero.
+            ValueError: if the direction is zero or does not match the policy's size.
         """
         direction = torch.as_tensor(direction, dtype=torch.float32)
         if direction.shape != self.direction.shape or not direction.any():
@@ -176,18 +176,18 @@ class Session:
         self.direction = torch.nn.functional.normalize(direction, dim=0)
 
     def choose_goal(self, goal: str) -> None:
-        """Begin again with the task's ``"fixed"`` or ``"random"`` goal; the simulator is a new one.
+        """Restart in a new simulator with the task's ``"fixed"`` or ``"random"`` goal.
 
         Raises:
             ValueError: if the task has no such goal.
         """
         check_choice("goal", goal, self.subject.task.goals)
-        env = self.subject.make_env(goal)  # if this fails, the simulator before goes on
+        env = self.subject.make_env(goal)  # if this fails, the old simulator is kept
         self.close()
         self._enter(env, goal)
 
     def reset(self, episode: int | None = None) -> None:
-        """Begin the present episode anew, or the one of this number."""
+        """Restart the current episode, or begin the given one."""
         self.episode = self.episode if episode is None else episode
         self.env.set_seed(self.subject.first_seed + self.episode)
         self._state = self.env.reset()
@@ -198,13 +198,13 @@ class Session:
         if self.root is not None:
             self.root.remember()
 
-    # What time does ----------------------------------------------------------------------------
+    # Simulation --------------------------------------------------------------------------------
 
     def advance(self, seconds: float, patience: float = 0.05) -> int:
-        """Let so much wall time pass; returns the number of steps in it.
+        """Simulate ``seconds`` of wall time at ``speed``; returns the number of steps.
 
-        Nothing happens unless the session plays or settles. After ``patience`` seconds a simulator
-        that is too slow for its speed falls behind, so that the page stays alive.
+        No effect unless the session plays, or a body follows a slider. After ``patience`` seconds
+        it drops the remaining time, so that a slow simulator does not block the page.
         """
         if not self._moving:
             self._budget = 0.0
@@ -226,9 +226,9 @@ class Session:
 
     @torch.no_grad()
     def step(self) -> float:
-        """One step of the environment; returns the simulated seconds that it took.
+        """One step of the environment; returns its duration in simulated seconds.
 
-        The sliders go on beyond the end of an episode, where a policy begins the next one.
+        After the end of an episode, sliders continue and policies begin the next episode.
         """
         if self.over and self.driver != "sliders":
             self.reset(self.episode + 1)
@@ -236,7 +236,7 @@ class Session:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             after = self.env.step(self._act(self._state))
         if self.driver == "sliders" and self.hold and self.root is not None:
-            import mujoco  # there, since its model is
+            import mujoco  # installed, since the model exists
 
             self.root.restore()
             mujoco.mj_forward(self.model, self.data)
@@ -253,7 +253,7 @@ class Session:
         return _STEP if self.data is None else max(self.data.time - before, 1e-4)
 
     def _act(self, state: TensorDictBase) -> TensorDictBase:
-        """The state with an action in it."""
+        """The state with the driver's action."""
         decoder = self.subject.decoder
         if self.driver == "explorer":
             return self.subject.explorer(state.set("direction", self.direction))
@@ -272,13 +272,13 @@ class Session:
 
     @property
     def success(self) -> bool | None:
-        """Whether the episode counts as solved so far; None if the task does not say."""
+        """Whether the episode counts as solved so far; None if the task does not tell."""
         needed = self.subject.task.solved_steps
         return self.solved if needed is None else self.solved and self.solved_steps >= needed
 
     @property
     def has_residual(self) -> bool:
-        """Whether the policy also moves muscles one by one."""
+        """Whether the policy also has a residual action per muscle."""
         decoder = self.subject.decoder
         return decoder is not None and self.subject.policy is not None and decoder.residual > 0
 

@@ -1,4 +1,4 @@
-"""What the page says, as HTML."""
+"""HTML texts of the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BOX = '<div style="font-size:0.85em;line-height:1.4;padding:0 1em 0.5em">{}</di
 
 
 def status(session: Session) -> str:
-    """Task, episode, return and ``solved``, as they are now."""
+    """Current task, step, return and success."""
     task, subject = session.subject.task, session.subject
     limit = subject.episode_steps
     goal = f" ({escape(str(session.goal))} goal)" if session.goal else ""
@@ -62,7 +62,7 @@ def _bar(name: str, strength: float) -> str:
 
 
 def activation_grid(names: Sequence[str], active: np.ndarray) -> str:
-    """One cell per actuator, in the colour that its tendon has."""
+    """One cell per actuator, in the colour of its tendon."""
     cells = []
     for name, value, color in zip(names, active, colors(active), strict=True):
         shade = "rgb({},{},{})".format(*color)
