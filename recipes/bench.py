@@ -1,4 +1,4 @@
-"""The former name of recipes/sweep.py."""
+"""Former name of recipes/sweep.py."""
 
 import sys
 

@@ -5,9 +5,9 @@
     python recipes/etl_sac.py env=myoHandPenTwirl seeds=[0,1,2] 'run_dir=runs/pen-${seed}'
     python recipes/etl_sac.py resume=runs/NAME
 
-Settings are given as key=value, nested ones with a dot: learn.sac.lr=1e-3. A run leaves its
-configuration, metrics, checkpoints, synergies and pictures in run_dir. These are all settings,
-with their defaults:
+Settings are given as key=value, nested ones with dots: learn.sac.lr=1e-3. A run writes its
+configuration, metrics, checkpoints, synergies and plots to run_dir. All settings with their
+defaults:
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
                 "collector.kind is 'distributed', of which a process has one; on a GPU, where "
                 "several seeds share a process, use process or ray."
             )
-        # Every one of them, before the first begins; with processes these say what there is to say.
+        # All are built, and so checked, before the first begins. In processes, only those print.
         experiments = [
             Experiment(run["config"], resume=run["resume"]) if apart else Experiment(**run)
             for run in runs
@@ -91,8 +91,8 @@ def main(config: DictConfig) -> None:
 
 
 def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
-    """The runs that the configuration asks for, of which there are several with ``seeds``, as
-    arguments of ``Experiment``."""
+    """Arguments of ``Experiment`` for each configured run; there are several with ``seeds`` or a
+    list of folders in ``resume``."""
     if config.resume is not None:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
         if not folders:
@@ -102,7 +102,7 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
             stored = settled(resumed_config(folder, given, defaults=defaults))
             yield {"config": stored, "resume": folder, "say": print}
         return
-    # Two runs that begin in the same second have the same name by default.
+    # By default, runs that begin in the same second have the same name.
     named = any(override.lstrip("+").startswith("run_dir=") for override in given)
     for own in of_each_seed(settled(config)):
         say = print if config.seeds is None else partial(print, f"seed {own.seed}:")
@@ -110,16 +110,16 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
 
 
 def settled(config: DictConfig) -> DictConfig:
-    """The configuration with a collector, also where that is left to be found out."""
+    """The configuration with ``collector.kind=auto`` resolved."""
     return choose_layout(config, say=print) if config.collector.kind == "auto" else config
 
 
 def report(summary: dict[str, Any], folder: Path) -> str:
-    """What a person wants to know at the end of a run."""
+    """Summary of a run for the user."""
     synergies, learned = summary.get("synergies", {}), summary.get("learn", {})
     goal = f" ({summary['goal']} goal)" if summary["goal"] else ""
     lines = ["", f"{summary['env']}{goal}, seed {summary['seed']}"]
-    # A bundle from elsewhere holds what whoever saved it chose to.
+    # Bundles from elsewhere may hold only some of these.
     known = [f"{words} {synergies[key]:.2f}" for key, words in SYNERGIES if key in synergies]
     if known:
         lines.append(f"  {'synergies':<12}{', '.join(known)}")

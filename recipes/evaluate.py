@@ -1,9 +1,9 @@
-"""Evaluate a run or an entry of the zoo on fixed seeds: return and solved, with intervals.
+"""Evaluate a run or an entry of the zoo on fixed seeds: return and success, with intervals.
 
     python recipes/evaluate.py run=runs/NAME episodes=50 video=true
     python recipes/evaluate.py zoo=NAME
 
-These are all settings, with their defaults:
+All settings with their defaults:
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def main(config: DictConfig) -> None:
 
 
 class Trained(NamedTuple):
-    """A policy, what it was before training, where it acts, and where results go.
+    """A policy, its untrained version, its environment and the folder for results.
 
     An entry of the zoo also has a card.
     """
@@ -131,7 +131,7 @@ def of_the_zoo(config: DictConfig) -> Trained:
 
 
 def open_recorder(config: DictConfig, env: EnvBase, size: tuple[int, int]) -> EpisodeRecorder:
-    """Before the evaluation, so that what is missing for it is missed at once."""
+    """Called before the evaluation, so that missing requirements are reported at once."""
     with one_sentence(RuntimeError):
         return EpisodeRecorder(
             env, size=size, camera=config.video_camera, seconds=config.video_seconds
@@ -150,7 +150,7 @@ def draw_episodes(config: DictConfig, trained: Trained, recorder: EpisodeRecorde
 
 
 def beside(card: zoo.Card, evaluation: Evaluation) -> str:
-    """Whether an entry does what its card says, episode by episode."""
+    """Comparison of the returns with those of the card, episode by episode."""
     told = card.evaluation["episodes"]["returns"][: len(evaluation.returns)]
     pairs = list(zip(told, evaluation.returns, strict=False))
     same = sum(math.isclose(one, other, rel_tol=1e-4, abs_tol=1e-4) for one, other in pairs)

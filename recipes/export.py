@@ -1,9 +1,9 @@
-"""Make an entry of the zoo out of a run: weights, card and synergy bundle in a small folder.
+"""Export a run as an entry of the zoo: weights, card and synergy bundle in a small folder.
 
     python recipes/export.py run=runs/NAME
     python recipes/evaluate.py zoo=zoo/myoHandPenTwirl
 
-In Python, zoo.load("zoo/myoHandPenTwirl") gives policy and environment. These are all settings,
+In Python, zoo.load("zoo/myoHandPenTwirl") returns the policy and its environment. All settings
 with their defaults:
 """
 

@@ -32,7 +32,7 @@ def main() -> None:
     widths = [max(map(len, column)) for column in zip(HEADER, *rows, strict=True)]
     for row in (HEADER, ["-" * width for width in widths], *rows):
         cells = zip(row, widths, strict=True)
-        # Words to the left, numbers to the right.
+        # Text is left-aligned, numbers are right-aligned.
         print("  ".join(c.rjust(w) if i > 2 else c.ljust(w) for i, (c, w) in enumerate(cells)))
     print(
         "\nAny Gymnasium id with continuous actions and any DMControl domain-task work too,\n"

@@ -3,10 +3,10 @@
     python recipes/report.py results=FOLDER [out=FOLDER] [frames=N] [control=sac] [repetitions=2000]
 
 results      folder with results.csv, one row per evaluation
-out          where report.md and the pictures go; the results' folder if left out
-frames       compare at this many environment frames; left out: the most that a task's runs share
+out          folder for report.md and the plots; default: that of the results
+frames       environment frames at which to compare; default: the most that a task's runs share
 control      the method against which improvement is measured
-repetitions  resamples of each bootstrap interval
+repetitions  number of resamples for each bootstrap interval
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Every method on every task with every seed: a queue that survives anything, and one table.
+"""Run every method on every task with every seed: a resumable queue, with one table of results.
 
     python recipes/sweep.py tasks=[myoHandPose] methods=[sac,etl] seeds=[0,1] frames=50000
     python recipes/report.py results=sweep
 
-Kill it at any time and start it again: finished runs stay, others go on from their checkpoints.
-Every evaluation is a row of results.csv. These are all settings, with their defaults:
+If killed, start it again: finished runs are kept, and others resume from their checkpoints. Every
+evaluation is a row of results.csv. All settings with their defaults:
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torchrl_etl.training import Run, Sweep, validate
 
 HERE = Path(__file__).parent
 CONF = HERE / "conf"
-# What tells runs and their rows in the table apart, and what of a sweep says it.
+# Settings that identify runs and their rows, and the sweep's setting for each.
 SAID_BY = {
     "env": "tasks",
     "goal": "tasks, as in TASK:random,",
@@ -73,7 +73,7 @@ def main(config: DictConfig) -> None:
 
 
 def queue(config: DictConfig) -> list[Run]:
-    """The runs that a configuration asks for, seed by seed: early results of methods compare."""
+    """The configured runs, ordered by seed, so that early results compare all methods."""
     methods = sorted(group_files(CONF, "method"))
     for name in ("tasks", "methods", "seeds"):
         value = config[name]
@@ -106,26 +106,26 @@ def queue(config: DictConfig) -> list[Run]:
         )
         command = [str(HERE / "etl_sac.py"), *overrides]
         runs.append(Run(name, goal or None, method, seed, path, command, config.frames))
-        # Every one of them, before the first begins.
+        # All runs are validated before the first begins.
         validate(compose([*overrides, f"frames={config.frames}"]))
     return runs
 
 
 def split_goal(task: str) -> tuple[str, str]:
-    """``TASK:random`` is a task and its goal; ``module:id``, of one's own, is a task."""
+    """Task and goal of ``TASK:random``; a user's ``module:id`` is a task without a goal."""
     name, _, goal = task.rpartition(":")
     return (name, goal) if goal in ("fixed", "random") else (task, "")
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """What ``etl_sac.py`` would make of these."""
+    """The configuration that ``etl_sac.py`` composes from these overrides."""
     hydra.core.global_hydra.GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         return hydra.compose("config", [*translate(overrides, CONF), "run_dir=unused"])
 
 
 class Display:
-    """A live table: where each run is, how it does, and how long it will take."""
+    """A live table of each run's progress, results and remaining time."""
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep = sweep

@@ -1,9 +1,9 @@
-"""Synergies of recorded muscles: how many there are, by cross-validation, and a bundle of them.
+"""Synergies of recorded muscle activity: their number, by cross-validation, and a bundle.
 
     python recipes/synergies.py data=emg.csv kind=nmf num=1..8
     python recipes/synergies.py data=emg.csv leave_out=[time] normalize=true trial=subject
 
-Column names are muscle names. These are all settings, with their defaults:
+Column names are muscle names. All settings with their defaults:
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main(config: DictConfig) -> None:
 
 
 def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
-    """The kind of synergies and keyword arguments of its model, all settings checked."""
+    """Checks all settings; returns the kind of synergies and keyword arguments of its model."""
     if config.data is None:
         raise ValueError("no recording is named; pass data=FILE, a .csv, .npy or .npz file.")
     if not isinstance(config.leave_out, ListConfig):
@@ -107,7 +107,7 @@ def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that could not be made; fitting takes minutes."""
+    """Reject a folder that cannot be created, before minutes of fitting."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise ValueError(f"{there} is a file, so out={folder} can be no folder; choose another.")
@@ -137,7 +137,7 @@ def load(config: DictConfig) -> Recording:
 
 
 def numbers_of_synergies(num: Any, muscles: int) -> Sequence[int]:
-    """What ``num`` asks for, less what is more than there are muscles."""
+    """The numbers in ``num`` that do not exceed the number of muscles."""
     if isinstance(num, str) and (ends := re.fullmatch(r"(\d+)\.\.(\d+)", num)):
         asked = list(range(int(ends[1]), int(ends[2]) + 1))
     else:
@@ -161,7 +161,7 @@ def leave(
     found: dict[int, CrossValidation],
     config: DictConfig,
 ) -> None:
-    """Table, bundle and pictures."""
+    """Write the table, the bundle and the plots."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("synergies", *CrossValidation._fields))

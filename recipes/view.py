@@ -1,11 +1,11 @@
-"""Look at a body in the browser: its synergies under sliders, its policies at work.
+"""View a body in the browser, moved by its policies or by sliders for its synergies.
 
     python recipes/view.py run=runs/NAME
     python recipes/view.py zoo=NAME
     python recipes/view.py bundle=runs/NAME/synergies env=myoHandPenTwirl
     ssh -L 8080:localhost:8080 MACHINE     # for a run on another machine
 
-These are all settings, with their defaults:
+All settings with their defaults:
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main(config: DictConfig) -> None:
         session = Session(open_subject(config))
         page = Page(session, host=config.host, port=config.port, say=print)
     print(f"{session.subject.name} is shown at {page.address} (Ctrl-C ends it)", flush=True)
-    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell's & has it ignored
+    for number in (signal.SIGINT, signal.SIGTERM):  # also in the background, where & ignores them
         signal.signal(number, signal.default_int_handler)
     try:
         page.run()
@@ -51,14 +51,14 @@ def main(config: DictConfig) -> None:
 
 
 def open_subject(config: DictConfig) -> Subject:
-    """What the settings name, which must be one thing."""
+    """The run, entry or bundle in the settings; exactly one must be given."""
     named = [source for source in SOURCES if config[source] is not None]
     if len(named) != 1:
         raise ValueError(
             f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
             "pass run=PATH, the folder that etl_sac.py printed, zoo=NAME, or bundle=PATH env=TASK."
         )
-    # env= of an entry says where its task is imported from: an entry does not get to say it.
+    # For an entry, env= gives the module of its task, which the entry itself may not import.
     own = {"run": ["env", "goal"], "zoo": ["goal"], "bundle": []}[named[0]]
     if given := [setting for setting in own if config[setting] is not None]:
         raise ValueError(f"{named[0]} has a task of its own; leave {' and '.join(given)} out.")
