@@ -1,13 +1,13 @@
-"""Synergies that follow from a body alone: each is the torque of one joint, or of several together.
+"""Synergies from a body's moment arms: each drives one joint, or a combination of joints.
 
     python studies/body_synergies.py myoLegWalk runs/body/myoLegWalk
 
-``synergies=body`` starts stage 2 with these (:func:`~torchrl_etl.envs.body_synergies`). This leaves
-a bundle of them by itself, and says how much of their variance turns joints.
+``synergies=body`` starts stage 2 with these (:func:`~torchrl_etl.envs.body_synergies`). This script
+writes them to a bundle and prints the share of their variance that turns joints.
 
-``--shuffle SEED`` lets the muscles change places, a control: the same activation at rest, as many
-synergies of the same strength, and no sense in them. ``--still`` is another: one synergy that moves
-no muscle, so that all there is of a body's synergies is the activation at rest.
+There are two controls. ``--shuffle SEED`` permutes the muscles: resting activation, number and
+strength of the synergies stay the same, but they no longer match the joints. ``--still`` has one
+synergy that moves no muscle, so only the resting activation of a body's synergies remains.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def main() -> None:
             "rest": arguments.rest,
             "shuffle": arguments.shuffle,
             "still": arguments.still,
-            "frames": 0,  # nothing is charged: this is a bound
+            "frames": 0,  # no frames are charged: this is a bound
             **facts(),
         }
         save_bundle(
@@ -84,7 +84,7 @@ def main() -> None:
 
 @torch.no_grad()
 def joint_share(env: EnvBase, decoder: SynergyDecoder, torques: np.ndarray) -> float:
-    """Share of the variance that turns joints; what is missing to 1 is where muscles saturate."""
+    """Share of the variance that turns joints; below 1 because muscles saturate."""
     generator = torch.Generator().manual_seed(0)
     synergies = 2 * torch.rand(4096, decoder.num_synergies, generator=generator) - 1
     return joint_effects(excitation(env, decoder.module(synergies)), torques).share

@@ -1,13 +1,13 @@
-"""Leg Walk with muscles that answer joint angles: does feedback in time make synergies pay?
+"""Leg Walk with feedback from joint angles: does fast feedback make synergies pay off?
 
-``env=studies.feedback_legs:FeedbackLegWalk-v0``, from the project's root, is myoLegWalk whose
-excitations get, before every step, the synergies of ``synergies=body`` with the coefficients
+``env=studies.feedback_legs:FeedbackLegWalk-v0``, from the project's root, is myoLegWalk with
+feedback through the synergies of ``synergies=body``. Each step adds them with coefficients
 
     Kp (q0 - q) - Kd q'
 
-of its 14 joints, clamped to [-1, 1]; q0 is the posture after a reset. A coefficient of a policy is
-then a shift of its joint's target angle, by 1 / Kp at most. ``+env_kwargs.kp=0 +env_kwargs.kd=0``
-is the task as it is.
+for its 14 joints, clamped to [-1, 1]; q0 is the posture after a reset. A policy's coefficient then
+shifts its joint's target angle by at most 1 / Kp. ``+env_kwargs.kp=0 +env_kwargs.kd=0`` gives the
+unmodified task.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ ENV_ID = "FeedbackLegWalk-v0"
 
 
 class JointFeedback(gym.Wrapper):
-    """Adds Kp (q0 - q) - Kd q' to the coefficients of the body's synergies; bounds are [0, 1].
+    """Adds the body's synergies with coefficients Kp (q0 - q) - Kd q' to the action, in [0, 1].
 
     Args:
-        env (gym.Env): legs of MyoSuite, whose actions are excitations.
+        env (gym.Env): a leg task of MyoSuite, whose actions are excitations.
 
     Keyword Args:
         kp (float): coefficient per rad, at least 0.

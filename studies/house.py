@@ -1,12 +1,12 @@
-"""Two counts of a checkout: the longest call chain to an equation, and settings checked twice.
+"""Two metrics of the code: the longest call chain to an equation, and settings checked twice.
 
     python studies/house.py CHECKOUT chain env=overactuated experiment=smoke run_dir=FOLDER
     python studies/house.py CHECKOUT checks
 
-A chain is the functions of the package from the run down to one of ``functional/`` that a loss
-calls; where a run pauses for an update (a generator), the functions that wait count too. Checks are
-compared by name: settings that ``training/config.py`` checks, and arguments that another file does.
-Names that are alike by chance count, so the second number is the most that there can be.
+A chain consists of the package's functions from the run down to a function of ``functional/`` that
+a loss calls. Suspended generators, in which a run pauses for an update, count too. Checks are
+compared by name: settings checked in ``training/config.py``, and arguments checked in other files.
+Coincidental matches count, so the second number is an upper bound.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def longest_chain(package: Path, recipe: Path, overrides: list[str]) -> list[str
         return f"{Path(code.co_filename).relative_to(package)} {code.co_qualname}"
 
     def waiting(frame: FrameType) -> Iterator[CodeType]:
-        """Functions that a caller of ``frame`` has in hand, each waiting for the next."""
+        """Suspended generators in a frame's local variables, each followed by its sub-generator."""
         for value in frame.f_locals.values():
             while isinstance(value, GeneratorType) and value.gi_frame is not None:
                 yield value.gi_code

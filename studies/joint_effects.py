@@ -1,14 +1,13 @@
-"""How much of what synergies command turns joints; no learning, one CSV row a bundle.
+"""Share of synergies' variance that turns joints; no learning, one CSV row per bundle.
 
     python studies/joint_effects.py runs/EXPLORED runs/OTHER --out docs/results/joint_effects.csv
 
-RUN is a run folder of ETL. Its bundle is asked for uniform coefficients, and the excitations that
-they decode to are laid beside the moment arms of its task: ``share``, ``chance`` and ``gain`` are
-those of :func:`~torchrl_etl.analysis.joint_effects`. ``shuffled`` is the mean share, and
-``shuffled_sd`` its standard deviation, when muscles change places at random: what a share must
-leave to say anything. The first run of a task brings three rows to compare with: uniform actions,
-as many random directions around the middle action, and the body's own synergies
-(``studies/body_synergies.py``). Rows are appended.
+RUN is a run folder of ETL. Uniform coefficients of its bundle are decoded to excitations and
+compared with the moment arms of its task. ``share``, ``chance`` and ``gain`` are explained in
+:func:`~torchrl_etl.analysis.joint_effects`. ``shuffled`` and ``shuffled_sd`` are mean and standard
+deviation of the share under random permutations of the muscles, the baseline for a share. The first
+run of a task adds three reference rows: uniform actions, as many random directions around the
+middle action, and the body's synergies (``studies/body_synergies.py``). Rows are appended.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def main() -> None:
 
 
 def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[dict[str, Any]]:
-    """One row of a run's bundle, after those that any bundle of its task is compared with."""
+    """The row of a run's bundle, after the reference rows of its task if asked for."""
     decoder, info = load_bundle(run, residual=0.0)
     env = make_env(config.env, goal=config.goal, seed=0)
     env.reset()
@@ -84,7 +83,7 @@ def rows_of(run: Path, config: DictConfig, with_references: bool) -> Iterator[di
 
 
 def references(env: EnvBase, torques: np.ndarray, num_synergies: int) -> dict[str, Tensor]:
-    """Actions [N, n] of no exploration."""
+    """Reference actions [N, n] that need no exploration."""
     torch.manual_seed(0)
     space = env.full_action_spec_unbatched["action"].space
     middle, half = (space.high + space.low) / 2, (space.high - space.low) / 2
@@ -98,7 +97,7 @@ def references(env: EnvBase, torques: np.ndarray, num_synergies: int) -> dict[st
 
 
 def shuffled(excitations: Tensor, torques: np.ndarray) -> dict[str, float]:
-    """The share of the same excitations [N, n] with their muscles in another order."""
+    """Mean and deviation of the share under random permutations of the muscles."""
     generator = torch.Generator().manual_seed(0)
     orders = [torch.randperm(torques.shape[1], generator=generator) for _ in range(SHUFFLES)]
     shares = [joint_effects(excitations[:, order], torques).share for order in orders]
@@ -107,7 +106,7 @@ def shuffled(excitations: Tensor, torques: np.ndarray) -> dict[str, float]:
 
 @torch.no_grad()
 def decoded(decoder: SynergyDecoder) -> Tensor:
-    """What a decoder makes of uniform coefficients."""
+    """Decoded actions for uniform coefficients."""
     generator = torch.Generator().manual_seed(0)
     return decoder.module(2 * torch.rand(SAMPLES, decoder.num_synergies, generator=generator) - 1)
 

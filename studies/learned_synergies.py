@@ -1,11 +1,11 @@
-"""Synergies of a policy that has learned a task: what explored ones could be at best.
+"""Synergies of a policy that has learned a task: an upper bound for explored ones.
 
     python studies/learned_synergies.py runs/SAC_RUN learned/hand_pose --num-synergies 8
 
-Takes the averaged actor of a run of plain SAC, lets it act with its noise, and fits a GMVAE, or
-principal components before the bounds (``--model pca``), on the mean actions in the states that it
-meets. The bundle that this leaves starts stage 2 as any other (``synergies=learned/hand_pose``), on
-the same task or on another one of the same muscles; its facts say how good the policy was.
+Samples episodes with the EMA actor of a plain SAC run, and fits a GMVAE, or principal components
+before the bounds (``--model pca``), to the mean actions in the visited states. The resulting bundle
+starts stage 2 like any other (``synergies=learned/hand_pose``), on the same task or on another one
+with the same muscles. Its facts include the return of the policy.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
         "vaf": vaf,
         "model": arguments.model,
         "return_of_policy": found,
-        "frames": 0,  # nothing is charged: this is a bound
+        "frames": 0,  # no frames are charged: this is a bound
         **facts(),
     }
     names = experiment.context.spec.actuators

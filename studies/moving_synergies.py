@@ -1,9 +1,9 @@
-"""A body moved by the synergies of a bundle one by one, as an animated picture.
+"""Animation of a body moved by each synergy of a bundle.
 
     python studies/moving_synergies.py runs/NAME/synergies docs/pictures [TASK]
 
-Each panel moves one synergy's coefficient through +1 and -1 while the others are 0: the bundle's
-first three, in its own order. No policy is at work. That of the README is of the bundle of
+Each panel moves the coefficient of one synergy through +1 and -1 while the others are 0, for the
+first three synergies of the bundle. No policy acts. The README's animation uses the bundle of
 
     python recipes/etl_sac.py env=myoHandPenTwirl stage=explore explore.frames=4000 seed=100
 
@@ -36,7 +36,7 @@ SIZE = (180, 212)  # pixels of a panel
 def main(bundle: str, folder: str, task: str | None = None) -> None:
     with one_sentence(ValueError, OSError, RuntimeError):
         session = Session(open_bundle(Path(bundle), task))
-        session.model.site_rgba[:, 3] = 0.0  # goals of the task, which nobody pursues here
+        session.model.site_rgba[:, 3] = 0.0  # hide the goals of the task
         with EpisodeRecorder(session.env, size=SIZE) as recorder:
             number = min(SHOWN, len(session.coefficients))
             sides = {

@@ -1,9 +1,9 @@
-"""What each muscle can do to each joint of a MyoSuite task, in newton metres.
+"""Torque of each muscle on each joint of a MyoSuite task, in newton metres.
 
     python studies/muscle_torques.py myoHandPose --joints mcp3 pm3 md3 --out torques.csv
 
-The torque on a joint of one muscle at full activation, all others off, at rest in the goal posture
-of a pose task, or in the initial posture of another.
+Each torque is for one fully active muscle, all others off, at zero velocity. The posture is the
+goal of a pose task, or the initial posture of another task.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""How a trained policy moves muscles, and how far more updates still move it.
+"""Muscle actions of a trained policy, and how far further updates change them.
 
     python studies/policy_drift.py RUN [RUN ...] --out docs/results/policy_drift.csv
 
-RUN is a run folder with a checkpoint of stage 2, ETL's or a rival's. On a thousand of the newest
-observations, where a muscle's bounds are ±1: ``mean_size`` is the root mean square of the muscles
-that the actor means, ``at_bounds`` the share of them within 0.001 of a bound, ``noise`` the
-standard deviation of those it draws. ``drift_K`` is the root mean square by which what it means
-changes in K more updates on the same transitions. Rows are appended.
+RUN is a run folder with a checkpoint of stage 2, of any method. Actions are scaled to [-1, 1] and
+evaluated at 1000 of the newest observations. ``mean_size`` is the root mean square of the mean
+action, ``at_bounds`` the share of its entries within 0.001 of a bound, and ``noise`` the standard
+deviation of sampled actions. ``drift_K`` is the root mean square change of the mean action after K
+more updates on the same transitions. Rows are appended.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> None:
         with one_sentence(ValueError, OSError):
             config = resumed_config(run, ["compile=false"])
             experiment = Experiment(config, resume=run)
-            stage = experiment.learned()  # or a clear sentence; then all that it has collected
+            stage = experiment.learned()  # or a clear error; the full checkpoint is loaded below
         checkpoints = experiment.folder.checkpoints(stage.name)
         Checkpoints(checkpoints, keep_last=2).load_newest_whole(stage.checkpoint())
         space = experiment.context.spec.action_spec.space

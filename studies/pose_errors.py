@@ -1,9 +1,9 @@
-"""Where a trained policy's posture is wrong on Hand Pose: one row per joint and time.
+"""Posture errors of a trained policy on Hand Pose: one row per joint and time step.
 
     python studies/pose_errors.py RUN --out docs/results/pose_errors.csv
 
-RUN is a run folder with a checkpoint of stage 2. The policy is deterministic, the episode the first
-of the evaluation. An error is the joint's angle minus its target, in radians.
+RUN is a run folder with a checkpoint of stage 2. The policy acts deterministically in the first
+evaluation episode. An error is the joint's angle minus its target, in radians.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
     env.set_seed(EVALUATION_SEED)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         env.rollout(
-            max(STEPS) + 2,  # TorchRL does not call back after the last
+            max(STEPS) + 2,  # TorchRL does not call the callback after the last step
             stage.learner.policy,
             callback=lambda *_: errors.append(hand.data.qpos - hand.target_jnt_value),
         )

@@ -1,4 +1,4 @@
-"""Rows of a study, added to a CSV file as they are finished."""
+"""Appends finished rows of a study to a CSV file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["append"]
 
 
 def append(out: Path, row: dict[str, Any]) -> None:
-    """Add a row to a file, which begins with the names of its columns."""
+    """Append a row to a file; a new file begins with the column names."""
     fresh = not out.exists()
     with out.open("a", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, row, lineterminator="\n")

@@ -1,8 +1,8 @@
-"""DynSyn whose groups hold muscles that do not move alike: a control of what its grouping is worth.
+"""DynSyn with randomly assigned muscle groups, a control for the value of its grouping.
 
     python recipes/etl_sac.py method=dynsyn method.kind=studies.shuffled_groups:ShuffledGroups
 
-Everything else is DynSyn's: number and sizes of the groups, noise, deviations, the charge.
+All else is as in DynSyn: number and sizes of groups, noise, deviations, charged frames.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torchrl_etl.training.loop import StopOnSignal
 
 
 class ShuffledGroups(DynSyn):
-    """Deals the groups that DynSyn found to the muscles at random, by the run's seed."""
+    """Permutes DynSyn's groups over the muscles, with the run's seed."""
 
     def found_groups(self, stop: StopOnSignal) -> list[int]:
         groups = super().found_groups(stop)

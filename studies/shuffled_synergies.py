@@ -1,10 +1,10 @@
-"""Synergies whose muscles have changed places: what is left of explored ones without their sense.
+"""Explored synergies with permuted muscles, a control for which muscles move together.
 
     python studies/shuffled_synergies.py runs/EXPLORED shuffled/hand_pose
 
-The bundle that this leaves spans as much, bends as much and varies as much as that of the run, but
-moves other muscles together. If stage 2 is as good with it, then not because of which ones. Beside
-it lies what the run explored, each action with the coefficients that come nearest to it now.
+The new bundle has the same range, nonlinearity and variance as that of the run, but moves other
+muscles together. If stage 2 is as good with it, the choice of muscles does not matter. The explored
+transitions are written beside it, with the best-fitting coefficients for each action.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     with torch.no_grad():
         last.weight.copy_(last.weight[places])
         last.bias.copy_(last.bias[places])
-    decoder.carry(None)  # its encoder knows the muscles by their places of before
+    decoder.carry(None)  # its encoder expects the original order of muscles
     save_bundle(
         decoder,
         arguments.out / "synergies",
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def nearest(decoder: SynergyDecoder, actions: Tensor) -> tuple[Tensor, float]:
-    """Coefficients [N, d] in [-1, 1] of what comes nearest to actions [N, n], and how near."""
+    """Coefficients [N, d] in [-1, 1] that best fit actions [N, n], and the mean squared error."""
     free = torch.zeros(len(actions), decoder.num_synergies, requires_grad=True)
     optimizer = torch.optim.Adam([free], LR)
     for _ in range(STEPS):

@@ -1,8 +1,8 @@
-"""How good the synergies of stage 1 are, by default and read literally; one CSV row a run.
+"""Quality of stage 1's synergies, with default settings and the paper's; one CSV row per run.
 
     python studies/synergies.py --env myoHandPose --seeds 0 1
 
-Finished rows are kept: run it again and it goes on with what is missing.
+Finished rows are kept; running it again adds the missing ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ORIGIN = ("commit", "machine", "torch", "torchrl", "mujoco", "myosuite")
 
 
 def explore(env: str, reading: str, seed: int, frames: int) -> dict[str, object]:
-    """One exploration; returns its row."""
+    """Run one exploration; returns its row."""
     with tempfile.TemporaryDirectory() as folder:
         overrides = [
             f"env={env}",

@@ -3,10 +3,9 @@
     python studies/task_gallery.py                             # all of them, in a minute or two
     python studies/task_gallery.py myoBaoding myoHandReach     # some
 
-makes docs/pictures/tasks/NAME.webp for the paper's tasks and the entries of the zoo: the body under
-the noise of ``exploration=noise``, with its default values. No policy is at work there, and an
-episode that ends is followed by the next. NAME-trained.webp is an entry's policy in the episode
-that its NAME.webp begins with.
+makes docs/pictures/tasks/NAME.webp for the paper's tasks and the entries of the zoo. It shows the
+body under the default noise of ``exploration=noise``, without a policy, for as many episodes as
+the clip holds. NAME-trained.webp shows an entry's policy, from the same initial state.
 """
 
 # ruff: noqa: E402  (MuJoCo chooses how it draws when it is first imported)
@@ -51,13 +50,13 @@ FOLDER = ROOT / "docs" / "pictures" / "tasks"
 NOISE = OmegaConf.load(ROOT / "recipes" / "conf" / "exploration" / "noise.yaml").exploration
 SECONDS = 3.0
 SIZE = (216, 288)  # pixels of a clip
-FINER = 3  # is drawn so many times larger
-QUALITIES, LARGEST = (30, 20, 10), 75_000  # the first that makes no more than so many bytes
-MARGIN = 0.1  # of height and width, around what moves
-CHANGE = 24  # of 255 levels, of a pixel that counts as moving
-GROUND = (1.3, 1.32, 1.36)  # in dim light
+FINER = 3  # supersampling factor
+QUALITIES, LARGEST = (30, 20, 10), 75_000  # take the first quality that fits into these bytes
+MARGIN = 0.1  # of height and width, around moving pixels
+CHANGE = 24  # minimum change of a moving pixel, of 255 levels
+GROUND = (1.3, 1.32, 1.36)  # brighter than white, for dim light
 AZIMUTHS = {"myoLegStairTerrainWalk": -40.0}  # the stairs are behind the usual camera
-FIRST_SEEDS_APART = 100  # or tasks of one body would have the same clip
+FIRST_SEEDS_APART = 100  # otherwise tasks with the same body would have the same clip
 
 
 def main(*names: str) -> None:
@@ -72,7 +71,7 @@ def main(*names: str) -> None:
 
 def draw_clips(name: str, seed: int) -> None:
     policy, env = zoo.load(name) if name in zoo.names(trained=True) else (None, make_env(name))
-    env = TransformedEnv(env, InitTracker())  # says where noise is drawn anew
+    env = TransformedEnv(env, InitTracker())  # tells the noise when an episode begins
     with recorder_of(env, name) as recorder:
         clips = {name: draw(recorder, noise(env), seed)}
         if policy is not None:
@@ -83,7 +82,7 @@ def draw_clips(name: str, seed: int) -> None:
 
 
 def recorder_of(env: EnvBase, name: str) -> EpisodeRecorder:
-    """Smooth edges by size in place of multisampling: a tenth of the time where no GPU draws."""
+    """Supersampling instead of multisampling takes a tenth of the time without a GPU."""
     model, _ = mujoco_state(env)
     quality = model.vis.quality
     quality.offsamples, quality.numslices, quality.numstacks = 0, 12, 6
@@ -94,16 +93,16 @@ def recorder_of(env: EnvBase, name: str) -> EpisodeRecorder:
 
 
 def simplify(env: EnvBase) -> None:
-    """Ground in one colour: a pattern is most of a file."""
+    """Give the ground one colour, since a pattern would make up most of a file."""
     model, _ = mujoco_state(env)
-    if not has_free_root(env):  # which resets, and so raises terrain
-        return  # the recorder leaves floors out
+    if not has_free_root(env):  # this resets the task, which sets its terrain
+        return  # the recorder hides floors
     floor, terrain = planes(model), model.geom_type == int(mujoco.mjtGeom.mjGEOM_HFIELD)
     model.geom_matid[floor | terrain], model.geom_rgba[floor | terrain, :3] = -1, GROUND
-    model.geom_size[floor] = 0  # without an end
+    model.geom_size[floor] = 0  # infinite
     if (model.geom_rgba[terrain, 3] > 0).any():
-        model.geom_rgba[floor, 3] = 0  # lies in the terrain
-    model.light_active[:] = 0  # spots on the floor; the recorder lights the body as it looks
+        model.geom_rgba[floor, 3] = 0  # it intersects the terrain
+    model.light_active[:] = 0  # these make spots on the floor; the recorder has its own light
 
 
 def names_of_all() -> list[str]:
@@ -122,25 +121,25 @@ def noise(env: EnvBase) -> TensorDictModuleBase:
 
 
 def draw(recorder: EpisodeRecorder, policy: TensorDictModuleBase, seed: int) -> np.ndarray:
-    """Frames [T, H, W, 3] of one episode after another."""
+    """Frames [T, H, W, 3] of consecutive episodes."""
     frames: list[np.ndarray] = []
     while len(frames) < SECONDS * FPS:
         frames += list(recorder.record(policy, 1, seed=seed)[0])
         seed += 1
     drawn = np.stack(frames[: round(SECONDS * FPS)])
-    drawn[~drawn.any(-1)] = 255  # a model without a sky has it black
+    drawn[~drawn.any(-1)] = 255  # without a skybox, the background is black
     return drawn
 
 
 def where_it_moves(frames: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns, in the proportions of the frames, around all that changes over time."""
+    """Rows and columns around all moving pixels, with the aspect ratio of the frames."""
     height, width = frames.shape[1:3]
     changes = np.ptp(frames.max(-1), axis=0) > CHANGE
     spans = [np.flatnonzero(changes.any(axis))[[0, -1]] for axis in (1, 0)]
     share = max(
         MARGIN + np.ptp(span) / whole for span, whole in zip(spans, (height, width), strict=True)
     )
-    share = min(max(share, 1 / FINER), 1.0)  # is never drawn larger than it was
+    share = min(max(share, 1 / FINER), 1.0)  # never enlarges rendered pixels
     cut = []
     for span, whole in zip(spans, (height, width), strict=True):
         length = round(share * whole)

@@ -1,13 +1,12 @@
-"""Returns of training episodes, by stretches of frames: less noisy than a fixed start's evaluation.
+"""Returns of training episodes per interval of frames: less noisy than fixed-start evaluations.
 
     python studies/training_returns.py RUN [RUN ...] --out docs/results/kill_test/training.csv
     python studies/training_returns.py RUN [RUN ...] --series loss_actor --out FILE.csv
 
-Where a task always starts alike, all evaluation episodes of a deterministic policy are the same
-one. Training acts with noise, in dozens of episodes between two evaluations: ``return`` is the mean
-of stage 2's log over the ``--stretch`` frames that end at ``frames``; ``--series`` names another
-one of that log. Stretches that a run did not finish, or log in, are left out. One CSV row a
-stretch; rows are appended.
+If a task has a fixed initial state, all evaluation episodes of a deterministic policy are equal.
+Training acts with noise, in dozens of episodes between evaluations. ``return`` is the mean in stage
+2's log over the ``--stretch`` frames up to ``frames``; ``--series`` selects another series of the
+log. Each complete interval with log entries gives one CSV row. Rows are appended.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def main() -> None:
 
 
 def stretches(frames: list[int], returns: list[float], length: int) -> list[tuple[int, float]]:
-    """The end of each whole stretch, and the mean of what was logged in it, if anything was."""
+    """The end and the mean of each complete interval with log entries."""
     ends = range(length, frames[-1] + 1, length) if frames else ()
     pairs = list(zip(frames, returns, strict=True))
     logged = [(end, [r for f, r in pairs if end - length < f <= end]) for end in ends]
