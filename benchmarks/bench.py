@@ -1,8 +1,8 @@
-"""Runs the benchmarks one after another and puts their figures into docs/performance.md.
+"""Runs the benchmarks in sequence and writes their results to docs/performance.md.
 
 python benchmarks/bench.py                       # all, as JSON lines
 python benchmarks/bench.py --only collection     # one of them
-python benchmarks/bench.py --write               # and into the page, and the lines beside it
+python benchmarks/bench.py --write               # also write the page and its JSON lines
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def run(name: str, peer: str | Path) -> list[Row]:
     if name in WITH_PEERS:
         command += ["--peer", peer]
     rows = []
-    # Each benchmark decides on its own threads.
+    # Each benchmark sets its own number of threads.
     env = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as process:
         for text in process.stdout:
@@ -65,7 +65,7 @@ def table(rows: Iterable[Row]) -> str:
 
 
 def written() -> list[Row]:
-    """The rows of the last runs."""
+    """The rows from earlier runs."""
     return [json.loads(text) for text in LINES.read_text(encoding="utf-8").splitlines()]
 
 
@@ -87,7 +87,7 @@ def main() -> None:
     rows = []
     for name in arguments.only:
         rows += run(name, arguments.peer)
-    if arguments.write:  # what was not run now stays
+    if arguments.write:  # rows of benchmarks that were not run are kept
         kept = [row for row in written() if row["benchmark"] not in arguments.only]
         write(sorted([*kept, *rows], key=lambda row: list(OPTIONS).index(row["benchmark"])))
 

@@ -1,12 +1,12 @@
-"""Frames a second: the bare simulator, TorchRL's own collectors, and ours, on all cores.
+"""Frames per second of the bare simulator, TorchRL's collectors and ours, on all cores.
 
     python benchmarks/collection.py
     python benchmarks/collection.py --tasks myoHandPenTwirl --repeats 9
 
-The bare simulators (``gymnasium.make``, or ``dm_control.suite.load`` behind Shimmy) repeat actions
-that our policy gave, since the cost of the physics depends on them. TorchRL's own way is a
-``MultiSyncCollector`` of one ``GymEnv`` a worker. Both stages run with all of their transforms and
-a policy of the recipes' size; every case has one process a core, one thread each.
+The bare simulators (``gymnasium.make``, or ``dm_control.suite.load`` with Shimmy) replay actions of
+our policy, since the cost of the physics depends on them. TorchRL's baseline is a
+``MultiSyncCollector`` with one ``GymWrapper`` per worker. Both stages run with all their transforms
+and a policy of the recipes' size. Every case has one process per core, with one thread each.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def explore_policy(task: str) -> TensorDictModuleBase:
 
 
 def bare_simulator(task: str, actions: np.ndarray, pipe: Connection) -> None:
-    """Steps one simulator as often as it is told."""
+    """Steps one simulator for the number of steps received from the pipe."""
     env, _ = _simulator(resolve_task(task), {})
     env.reset(seed=0)
     step = 0
@@ -97,7 +97,7 @@ class BareSimulators:
 
 
 def frames_per_second(next_batch: Callable[[], object], frames: int, per_batch: int) -> float:
-    next_batch()  # may have been collected before; the one after it begins now
+    next_batch()  # may have been collected ahead of time; the next one begins now
     begun = time.perf_counter()
     for _ in range(max(1, frames // per_batch)):
         next_batch()
@@ -118,7 +118,7 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
 
     if stage == "explore":
         acting, make = policy, partial(env, num_envs)
-    else:  # as in the recipes: the decoder acts as a part of the policy
+    else:  # as in the recipes, where the decoder is part of the policy
         acting, make = synergetic, partial(recipe_env, task, num_envs)
     per_batch = workers * num_envs * arguments.steps
     batches: Batches = make_batches(
@@ -161,7 +161,7 @@ def compare(task: str, stage: str, arguments: argparse.Namespace) -> None:
     batches.close()
     stock.shutdown()
     bare.close()
-    for scheme in stock._weight_sync_schemes.values():  # else its __del__ hangs at exit
+    for scheme in stock._weight_sync_schemes.values():  # otherwise __del__ hangs at exit
         scheme.shutdown()
 
 

@@ -1,15 +1,14 @@
-"""Frames a second of training: ours (SAC, both stages of ETL), SBX and Stable-Baselines3.
+"""Training frames per second of ours (SAC, both stages of ETL), SBX and Stable-Baselines3.
 
     python benchmarks/end_to_end.py --peer none
     python benchmarks/end_to_end.py --envs myoLegWalk --seconds 10 --repeats 5
 
-The same task, networks (two layers of 256, ReLU, no layer norm), batch (256) and updates a frame,
-in processes that take turns on all cores for as many seconds each; while one is measured, the
-others wait. Ours run compiled (``_eager``: not), each in the way to share the cores that
-``collector=auto`` finds the fastest. Stable-Baselines3 collects and learns in turn, as it is built
-to. So does SBX, once with an update (``sbx``) and once with 16 in one compiled call
-(``sbx_scanned``) after the frames of one environment, and once after a step of eight environments
-in processes (``sbx_8_envs``).
+All use the same task, networks (two layers of 256, ReLU, no layer norm), batch size (256) and
+replay ratio. Their processes take turns on all cores, for the same time each; the others wait.
+Ours are compiled, except for ``_eager``, with the allocation of cores chosen by ``collector=auto``.
+Stable-Baselines3 alternates between collection and updates. So does SBX in three cases: one update
+(``sbx``) or 16 in one compiled call (``sbx_scanned``) after the frames of one environment, and
+updates after a step of eight environments in processes (``sbx_8_envs``).
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ OURS = {
 }
 FRAMES_PER_UPDATE = (1, 8)
 BY_DEFAULT = ("sac", "etl_learn", "etl_explore")
-PEERS = {  # library, and its environments
+PEERS = {  # library, number of environments
     "sbx": ("sbx", 1),
     "sbx_8_envs": ("sbx", 8),
     "stable_baselines3": ("stable_baselines3", 1),
@@ -44,7 +43,7 @@ PEERS = {  # library, and its environments
 
 
 def peer_cases(frames_per_update: int) -> dict[str, tuple[str, int]]:
-    """Which of ``PEERS`` is measured with how many updates at a time, by the name of a case."""
+    """For each case, the name in ``PEERS`` and the number of updates at a time."""
     return {
         "sbx": ("sbx", 1),
         "sbx_scanned": ("sbx", 16),
@@ -54,10 +53,10 @@ def peer_cases(frames_per_update: int) -> dict[str, tuple[str, int]]:
 
 
 class Contender(Child):
-    """A process that trains for as many seconds as it is told."""
+    """A process that trains for a requested number of seconds."""
 
     def await_ready(self) -> dict[str, Any]:
-        """What it says of itself before: a peer its versions, ours how it shares the cores."""
+        """Information before ``ready``: versions of a peer, or our allocation of cores."""
         lines = list(iter(self.answer, "ready"))
         return json.loads(next((line for line in lines if line.startswith("{")), "{}"))
 
@@ -68,7 +67,7 @@ class Contender(Child):
 def start_ours(
     task: str, frames_per_update: int, methods: list[str]
 ) -> dict[str, tuple[Contender, dict[str, Any]]]:
-    """Our contenders, and how each shares the cores."""
+    """Our contenders, with their allocation of cores."""
     script = [sys.executable, HERE / "training.py", "--env", task]
     script += ["--frames-per-update", str(frames_per_update), "--method"]
     ours = {}
@@ -76,7 +75,7 @@ def start_ours(
         method, *overrides = OURS[name]
         command = [*script, method, "collector=auto", *overrides]
         contender = Contender(command, stderr=subprocess.DEVNULL)
-        ours[name] = contender, contender.await_ready()  # before the next tries out its own
+        ours[name] = contender, contender.await_ready()  # before the next one's own benchmark
     return ours
 
 

@@ -1,7 +1,7 @@
-"""The floor of an update: the time of its matrix products alone.
+"""Lower bound for the time of an update: its matrix products only.
 
-What compiled updates multiply by (``torch.mm``, or oneDNN's operation) takes it for exactly the
-products of an update, each on tensors of its own, without a gradient where none is needed.
+These are exactly the products of an update, on separate tensors, without unneeded gradients. They
+use the same operation as compiled updates: ``torch.mm`` or oneDNN's.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torchrl_etl.learners.products import by_onednn, faster_products, multiply
 __all__ = ["floor", "products", "sac_products", "stage_products"]
 
 Shape = tuple[int, int, int]
-"""Rows, inner size and columns of a product."""
+"""Rows, inner dimension and columns of a product."""
 
 
 def products(batch: int, widths: list[int], passes: str) -> Iterator[Shape]:
-    """Products of a perceptron's passes.
+    """Products in the passes of an MLP.
 
-    ``f``: forward; ``w``: gradient of its weights; ``h``: of its hidden layers, on the way there;
-    ``i``: of its input.
+    ``f``: forward; ``w``: gradient of the weights; ``h``: gradient of the hidden activations;
+    ``i``: gradient of hidden activations and the input.
     """
     layers = list(pairwise(widths))
     for kind in passes:
@@ -40,12 +40,12 @@ def products(batch: int, widths: list[int], passes: str) -> Iterator[Shape]:
 
 
 def sac_products(batch: int, inputs: int, action: int, out: int, hidden: list[int]) -> list[Shape]:
-    """Twin critics on ``inputs`` + ``action``, an actor that emits ``out``."""
+    """Products of twin critics on ``inputs`` + ``action``, and an actor with ``out`` outputs."""
     critic = [inputs + action, *hidden, 1]
     shapes = list(products(batch, [inputs, *hidden, 2 * out], "ffwh"))
     for _ in range(2):
-        shapes += products(batch, critic, "ffwhfh")  # target, regression, under the actor
-        shapes.append((batch, hidden[0], action))  # and its gradient at the action alone
+        shapes += products(batch, critic, "ffwhfh")  # target, regression, actor loss
+        shapes.append((batch, hidden[0], action))  # input gradient for the action only
     return shapes
 
 

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the recipe's sizes, cases that take turns, a JSON line for each."""
+"""Shared code of the benchmarks: the recipe's sizes, interleaved cases, and JSON lines."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PLAIN = ("learner=plain", "num_synergies=4", "learn.decoder.residual=0")
 
 
 def recipe(*overrides: str) -> DictConfig:
-    """The configuration of ``recipes/etl_sac.py`` with these, for plain networks and synergies."""
+    """The configuration of ``recipes/etl_sac.py`` with ``PLAIN`` and these overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=[*PLAIN, *overrides])
 
 
 def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
-    """The learn stage's policy: an actor of two layers of 256, a decoder of two of 128."""
+    """The learn stage's policy: an actor with two layers of 256, a decoder with two of 128."""
     env = make_env(task)
     bounds = env.full_action_spec_unbatched["action"]
     inputs = {"observation": env.observation_spec["observation"].shape[-1]}
@@ -48,19 +48,19 @@ def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
 
 
 def training(stage: Stage, updates: int, at_once: int) -> Work[None]:
-    """So many updates by the way that training takes, as if frames had earned ``at_once`` each."""
+    """Updates through the training code, as if each batch of frames allowed ``at_once``."""
     for _ in range(max(1, updates // at_once)):
         stage.progress.owed += at_once
         yield from stage.learn()
 
 
 def train(stage: Stage, updates: int, at_once: int) -> None:
-    """Do the work of :func:`training`."""
+    """Run :func:`training` to its end."""
     alone(training(stage, updates, at_once))
 
 
 class Child:
-    """A process that answers each line that it is sent with a line."""
+    """A process that answers each line of input with a line of output."""
 
     def __init__(self, command: Sequence[str | Path], **options: Any) -> None:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -83,10 +83,10 @@ class Child:
 
 
 def interleave(cases: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Measure every case in turn, ``repeats`` times over; one unrecorded round comes first.
+    """Measure all cases in turn, for ``repeats`` rounds after an unrecorded first one.
 
-    What else the machine does then falls on all cases alike, and a ratio within a round holds
-    where the figures themselves drift.
+    Other load on the machine then affects all cases alike, and ratios within a round stay valid
+    while the measurements themselves drift.
     """
     values: dict[str, list[float]] = {name: [] for name in cases}
     for round_ in range(repeats + 1):
@@ -114,7 +114,7 @@ def line(
     peers: Mapping[str, list[float]] | None = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """Print and return one case: median, spread, and the median ratio to each other, by rounds."""
+    """Print and return one case: median, spread, and median per-round ratios to ``peers``."""
     row = {
         "benchmark": benchmark,
         "case": case,
@@ -132,6 +132,6 @@ def line(
 
 
 def ratio(values: list[float], others: list[float]) -> list[float]:
-    """Median and spread of the ratios of one case to another, each within a round."""
+    """Median and spread of the per-round ratios of one case to another."""
     ratios = [mine / other for mine, other in zip(values, others, strict=True)]
     return [round(median(ratios), 3), round(spread(ratios), 3)]

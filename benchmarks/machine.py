@@ -1,4 +1,4 @@
-"""The machine that a figure was measured on: its processor, and how busy it was."""
+"""The machine of a measurement: its processor and its load."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LOAD_AT_START = round(os.getloadavg()[0], 2)
 
 
 def machine(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
-    """Processor, the instructions that matrix products gain from, and the load at the start."""
+    """Processor, its instruction sets for matrix products, and the load at the start."""
     try:
         lines = cpuinfo.read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
@@ -28,9 +28,9 @@ def machine(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 
 
 def on_one_core() -> None:
-    """Keep this process, and those that it starts from now on, on one core where that is possible.
+    """Pin this process, and those that it starts afterwards, to one core if possible.
 
-    Libraries that take no number of threads from outside then make one.
+    Libraries whose number of threads cannot be set then use one.
     """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})

@@ -4,9 +4,9 @@
     python benchmarks/memory.py --env myoLegWalk --transitions 1000000
 
 The buffer of stage 2 is filled with copies of one collected batch, since collecting a million
-frames takes an hour; then the run goes on collecting in its worker and learning. Memory is that of
-the learner and all of its workers: what only they have (``private``: anonymous and shared memory)
-and what the operating system keeps of the buffer's file and may drop at any time (``file``).
+frames takes an hour. Then the run continues to collect in its worker and to learn. Memory is the
+total of the learner and its workers: ``private`` is anonymous and shared memory, and ``file`` is
+memory-mapped file pages, which the operating system may drop at any time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torchrl_etl.training import alone
 
 
 def resident_gigabytes() -> dict[str, float]:
-    """By kind, over this process and its children (Linux); shared pages are divided among them."""
+    """Memory by kind of this process and its children (Linux), with shared pages split evenly."""
     processes = [os.getpid(), *(child.pid for child in multiprocessing.active_children())]
     total = {"private": 0, "file": 0}
     for process in processes:

@@ -1,8 +1,8 @@
-"""SAC of Stable-Baselines3, or of SBX, training as told: the peers of end_to_end.py.
+"""Training with SAC of Stable-Baselines3 or SBX: the peers of end_to_end.py.
 
-Runs in their environment. Its versions come first; then it reads lines of three numbers: seconds,
-frames per update and updates made at a time. It trains for so long and answers with the frames a
-second.
+Runs in the peers' virtual environment and first prints its versions. Each input line has three
+numbers: seconds, frames per update, and updates at a time. It trains for these seconds and prints
+the frames per second.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LEARNING_STARTS = 500
 
 
 class Until(BaseCallback):
-    """Stops training with the first rollout that begins when the time is up."""
+    """Stops training at the first rollout that begins after the deadline."""
 
     def __init__(self, end: float) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class Until(BaseCallback):
 
 
 def make_agent(library: str, env: str, envs: int) -> OffPolicyAlgorithm:
-    """SAC with ReLU nets without layer norm, about to learn."""
+    """SAC with ReLU networks without layer norm, after its initial random frames."""
     agent = import_module(library).SAC(
         "MlpPolicy",
         make_vec_env(

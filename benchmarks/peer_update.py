@@ -1,7 +1,7 @@
-"""A SAC update of Stable-Baselines3, or of SBX, for update.py, in an environment of its own.
+"""SAC updates of Stable-Baselines3 or SBX for update.py, in their own virtual environment.
 
-Reads a line for each block of updates and answers with a line of JSON; the versions come first. It
-uses as many threads as the cores that it is started on.
+First prints the versions. Each input line is a number of updates, and is answered with a line of
+JSON. Uses as many threads as it may use cores.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ PACKAGES = {
 
 
 def versions(library: str) -> str:
-    """Of what the library runs on, as a line of JSON."""
+    """Versions of the library and its backend, as a line of JSON."""
     return json.dumps({name: version(name) for name in PACKAGES[library]})
 
 
 class Sizes(gymnasium.Env):
-    """Not a task: sizes for an agent."""
+    """A dummy environment with the sizes for an agent."""
 
     def __init__(self, observation_dim: int, action_dim: int) -> None:
         self.observation_space = Box(-np.inf, np.inf, (observation_dim,), np.float32)
@@ -44,7 +44,7 @@ class Sizes(gymnasium.Env):
 
 
 def make_agent(case: dict[str, Any]) -> OffPolicyAlgorithm:
-    """SAC with a buffer full of random transitions, learning from ReLU nets without layer norm."""
+    """SAC with ReLU networks without layer norm, and a buffer full of random transitions."""
     env = Sizes(case["observation_dim"], case["action_dim"])
     agent = import_module(case["library"]).SAC(
         "MlpPolicy",
@@ -69,7 +69,7 @@ def make_agent(case: dict[str, Any]) -> OffPolicyAlgorithm:
 
 
 def finish(agent: OffPolicyAlgorithm) -> None:
-    """Wait for what JAX has only been asked to compute."""
+    """Wait for JAX's asynchronous computations."""
     if "jax" in sys.modules:
         states = agent.policy.actor_state, agent.policy.qf_state, agent.ent_coef_state
         import_module("jax").block_until_ready(states)
@@ -83,7 +83,7 @@ def main() -> None:
     for line in sys.stdin:
         calls = max(1, int(line) // at_once)
         start = time.process_time()
-        for _ in range(calls):  # one call of SBX's is one scan
+        for _ in range(calls):  # one call of SBX is one scan
             agent.train(gradient_steps=at_once, batch_size=case["batch_size"])
         finish(agent)
         milliseconds = 1e3 * (time.process_time() - start) / (calls * at_once)

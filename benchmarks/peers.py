@@ -1,4 +1,4 @@
-"""The environment of the peers, which ``make`` installs from ``peers.lock``."""
+"""The peers' virtual environment, which ``make`` installs from ``peers.lock``."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MISSING = "import sys, importlib.util as u; print(*[n for n in sys.argv[1:] if n
 
 
 def peer_python(given: str | Path) -> Path | None:
-    """The peers' Python as ``--peer`` names it; ``None`` where it says to leave them out.
+    """The peers' Python given by ``--peer``; ``None`` if it is ``"none"``.
 
     Raises:
-        SystemExit: in a sentence, where there are no peers.
+        SystemExit: with an error message, if the peers are not installed.
     """
     if str(given) == NONE:
         return None

@@ -1,11 +1,11 @@
-"""Frames a second of one and of two workers, by kind of collector; bytes a frame and a push.
+"""Frames per second of one and two workers by kind of collector; bytes per frame and push.
 
     python benchmarks/scaling.py            # JSON lines
     python benchmarks/scaling.py --write    # and docs/results/scaling.csv
 
-Kinds and numbers of workers take turns within every repetition, so that what else the machine
-does falls on all of them. The learner pushes weights before each batch, as the stages do. CPU time
-is that of the learner and of everything below it, so it tells work from waiting.
+Kinds and numbers of workers are interleaved within every repetition, so that other load affects
+all of them. The learner pushes weights before each batch, as the stages do. CPU time is the total
+of the learner and its descendants, and shows how much of the time is waiting.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ KEPT_NEXT = ("observation", "reward", "done", "terminated")
 
 
 def cpu_seconds() -> tuple[float, float]:
-    """CPU time so far of this process, and of all its descendants that are alive (Linux)."""
+    """CPU time so far of this process, and of all its live descendants (Linux)."""
     parents, seconds = {}, {}
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             try:
                 fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            except OSError:  # it has ended in the meantime
+            except OSError:  # the process has ended
                 continue
             parents[int(folder.name)] = int(fields[1])
             ticks = int(fields[11]) + int(fields[12])
@@ -56,7 +56,7 @@ def cpu_seconds() -> tuple[float, float]:
 
 
 def measure(kind: str, workers: int, arguments: argparse.Namespace) -> dict[str, float]:
-    """One start of the workers; what ``arguments.seconds`` of collecting gave."""
+    """Start the workers and measure ``arguments.seconds`` of collection."""
     policy = synergy_policy(arguments.env, arguments.synergies)
     share = arguments.num_envs * arguments.steps
     batches = make_batches(
@@ -70,7 +70,7 @@ def measure(kind: str, workers: int, arguments: argparse.Namespace) -> dict[str,
     )
     batches.restart(seed=0)
     try:
-        for _ in range(2 * workers + 1):  # the first batches hold the resets
+        for _ in range(2 * workers + 1):  # the first batches include the resets
             batch = batches.next()
         began, (learner, below), frames = time.perf_counter(), cpu_seconds(), 0
         while time.perf_counter() - began < arguments.seconds:

@@ -1,14 +1,14 @@
-"""Milliseconds an update of one seed: several seeds in one pass beside one after another.
+"""Milliseconds per update of one seed: several seeds in one pass, compared with sequential ones.
 
     python benchmarks/seeds.py
     python benchmarks/seeds.py --seeds 8 --compile
     python benchmarks/seeds.py --seeds 16 --compile --device cuda --stages learn --products high
 
-One thread and CPU time, or with ``--device cuda`` the time until the GPU is done; both take turns
-in blocks of updates. ``explore`` and ``learn`` are the recipe's stages, which make the 64 updates
-that a batch of frames earns as training makes them: sampling, each seed's random numbers and its
-own state of the generators are included. A ratio is to the same seeds one after another; times the
-number of seeds, it is to one of them alone. ``--products high`` lets a GPU multiply in TF32.
+Measures CPU time on one thread, or with ``--device cuda`` the time until the GPU is done; both
+cases alternate in blocks of updates. ``explore`` and ``learn`` are the recipe's stages. They make
+the 64 updates of a batch of frames through the training code, including sampling and each seed's
+random numbers and generator state. Ratios are to the same seeds in sequence; multiplied by the
+number of seeds, to a single seed. ``--products high`` allows TF32 on a GPU.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is there
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before importing torch
 
 import time
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ AT_ONCE = 64  # a batch of frames with one update for each
 
 
 def filled(seed: int, name: str, *overrides: str) -> Stage:
-    """A stage as the recipe builds it, its buffer filled."""
+    """A stage as built by the recipe, with a filled buffer."""
     experiment = Experiment(recipe(*overrides, f"seed={seed}", "threads=1", "run_dir=unused"))
     stage = Explorer(experiment.context).stage if name == "explore" else experiment.method.stage()
     spec, d = experiment.context.spec, experiment.config.num_synergies
@@ -47,7 +47,7 @@ def filled(seed: int, name: str, *overrides: str) -> Stage:
 
 
 def seconds() -> float:
-    """CPU time, or where there is a GPU at work, the time at which that is done."""
+    """CPU time, or wall time after synchronization if a GPU is in use."""
     if not torch.cuda.is_initialized():
         return time.process_time()
     torch.cuda.synchronize()
@@ -55,11 +55,10 @@ def seconds() -> float:
 
 
 def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, list[float]]:
-    """Milliseconds an update of one seed, block by block; one unrecorded block comes first.
+    """Milliseconds per update of one seed for each block, after an unrecorded first block.
 
-    All blocks together are one call of ``together``, since it holds what is compiled. The work of
-    the first seed therefore looks at the clock, and has the seeds updated one after another
-    meanwhile.
+    All blocks share one call of ``together``, which holds the compiled code. The work of the first
+    seed therefore takes the times, and also runs the sequential updates of all seeds.
     """
     taken: dict[str, list[float]] = {"one_by_one": [], "together": []}
 

@@ -1,10 +1,10 @@
-"""Wall-clock seconds of two seeds on a CPU: one command, beside a command for each.
+"""Wall-clock seconds of two seeds on a CPU: one command, compared with one command each.
 
     python benchmarks/seeds_wall_clock.py
     python benchmarks/seeds_wall_clock.py --env myoLegWalk --frames 20000
 
-Whole commands of the recipe, from start to summary, on all cores; they take turns. Two commands
-have a thread of PyTorch each. A ratio is to them: 1 where company makes no seed slower.
+Measures whole commands of the recipe in turn, from start to summary, on all cores. The two separate
+commands have one PyTorch thread each. Ratios are to these; 1 means equally fast.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SEEDS = (0, 1)
 
 
 def seconds(commands: list[list[str]]) -> float:
-    """Until the last of these has ended, which all begin at once."""
+    """Time from the simultaneous start of the commands until the last one ends."""
     with TemporaryDirectory() as folder:
         begun = time.perf_counter()
         processes = [

@@ -1,11 +1,11 @@
-"""Seconds from the command to the first update: compiled at first, again, and not; SBX beside.
+"""Seconds from the command to the first update, eager and compiled, with SBX for comparison.
 
     python benchmarks/start.py --peer none
 
-Plain SAC on one task as ``end_to_end.py`` trains it, in a process of its own each time: Python and
-its libraries load, the simulators are built, 500 frames collected, the update compiled and made
-once. ``compiled`` begins with an empty cache of compiled code, ``compiled_again`` finds that of the
-run before, as every run but the first one of a machine does.
+Starts plain SAC on one task, as in ``end_to_end.py``, in a new process each time. This includes
+loading Python and its libraries, building the simulators, collecting 500 frames, compiling the
+update and making it once. ``compiled`` begins with an empty compilation cache. ``compiled_again``
+reuses that of the previous run, like every run after the first one on a machine.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torchrl_etl.envs.tasks import resolve_task
 def start(
     command: list[str | Path], order: str | None = None, **environment: str
 ) -> tuple[float, dict[str, Any]]:
-    """Seconds until it learns, which a peer does when it is first told to, and what it says."""
+    """Seconds until the first update, triggered by ``order`` for a peer, and the child's output."""
     begun = time.perf_counter()
     env = {**os.environ, **environment}
     contender = Contender(command, stderr=subprocess.DEVNULL, env=env)
@@ -62,7 +62,7 @@ def main() -> None:
     values: dict[str, list[float]] = {name: [] for name in cases}
     more: dict[str, Any] = {}
     for _ in range(arguments.repeats):
-        with TemporaryDirectory() as cache:  # the first compilation fills it, the second finds it
+        with TemporaryDirectory() as cache:  # filled by the first compilation, used by the second
             for name, case in cases.items():
                 taken, said = case(TORCHINDUCTOR_CACHE_DIR=cache)
                 values[name].append(taken)

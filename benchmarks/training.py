@@ -1,7 +1,7 @@
-"""Our side of end_to_end.py: a stage, or plain SAC, training as told.
+"""Our side of end_to_end.py: training of a stage or plain SAC.
 
-How it shares the cores comes first, once it has made an update; then it reads a number of seconds a
-line, trains for so long, and answers with the frames a second.
+First prints its allocation of cores, after one update. Each input line is a number of seconds. It
+trains for these and prints the frames per second.
 """
 
 from __future__ import annotations

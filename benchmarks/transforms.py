@@ -1,9 +1,9 @@
-"""What ETL's transforms cost a step: environments with and without them, in TorchRL's own rollout.
+"""Time per step of ETL's transforms: environments with and without them in TorchRL's rollout.
 
     python benchmarks/transforms.py
 
-The environment is the small analytic one, whose own step is nearly free, in batches of eight; the
-time is that of a step of the whole batch under ``env.rollout`` with a random policy.
+Uses the small analytic environment, whose own step is nearly free, in batches of eight. Times are
+per step of the whole batch in ``env.rollout`` with a random policy.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Milliseconds an update: ours, TorchRL's recipe, Stable-Baselines3, SBX, and the products alone.
+"""Milliseconds per update: ours, TorchRL's recipe, Stable-Baselines3, SBX, and products only.
 
     python benchmarks/update.py --peer none
     make .venv-peers/.complete && python benchmarks/update.py --compile --repeats 15
 
-CPU time on one core, so that other processes disturb little; the cases take turns in blocks of
-updates. Two layers of 256 with ReLU and without layer norm, a batch of 256, everywhere. Random
-transitions of one task's sizes stand in for a buffer: the cost of an update does not depend on what
-they hold. ``floor`` is what the matrix products of an update take (``floor.py``).
+Measures CPU time on one core, which other processes affect little; cases alternate in blocks of
+updates. All have two layers of 256 with ReLU and without layer norm, and a batch of 256. The buffer
+holds random transitions with the sizes of one task, since their values do not affect the cost.
+``floor`` is the time of an update's matrix products (``floor.py``).
 
-``sac`` is SAC on raw actions, the same nets for all libraries; ``explore`` and ``learn`` are the
-whole updates of both stages. Ours are called as training calls them, 16 updates earned at a time,
-or ``_singly`` one. ``sbx`` makes 16 updates in one compiled call (``gradient_steps=16``), or
-``_singly`` one.
+``sac`` is SAC on raw actions, with the same networks for all libraries. ``explore`` and ``learn``
+are the whole updates of both stages. Ours run through the training code, 16 updates at a time, or
+one for ``_singly``. ``sbx`` makes 16 updates in one compiled call (``gradient_steps=16``), or one
+for ``_singly``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import argparse
 import json
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is there
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before importing torch
 
 import time
 from collections.abc import Callable
@@ -45,12 +45,12 @@ from torchrl_etl.training import Stage
 
 TRANSITIONS = 4096
 AT_ONCE = 16
-PEERS = {  # library, updates in a call
+PEERS = {  # library, updates per call
     "stable_baselines3": ("stable_baselines3", AT_ONCE),
     "sbx": ("sbx", AT_ONCE),
     "sbx_singly": ("sbx", 1),
 }
-# What a case is compared with, where that was measured too.
+# References of each case, used if measured.
 COMPARED = {
     "torchrl/sac": ["compiled/sac"],
     "stable_baselines3/sac": ["compiled/sac", "floor/sac"],
@@ -67,7 +67,7 @@ COMPARED = {
 
 
 def stages(env: str, compile: bool) -> dict[str, Stage]:
-    """Plain SAC and both stages as the recipe builds them, their buffers filled."""
+    """Plain SAC and both stages as built by the recipe, with filled buffers."""
     overrides = [f"env={env}", "run_dir=unused", "threads=1", f"compile={str(compile).lower()}"]
     overrides += ["actor.layer_norm=false"]
     etl = Experiment(recipe(*overrides))
@@ -85,7 +85,7 @@ def stages(env: str, compile: bool) -> dict[str, Stage]:
 
 
 def transitions(observation_dim: int, action_dim: int, num_synergies: int) -> TensorDict:
-    """Every entry that some update reads."""
+    """Random transitions with all entries that any update reads."""
     direction = torch.nn.functional.normalize(torch.randn(TRANSITIONS, num_synergies), dim=-1)
     flags = torch.zeros(TRANSITIONS, 1, dtype=torch.bool)
     return TensorDict(
@@ -107,7 +107,7 @@ def transitions(observation_dim: int, action_dim: int, num_synergies: int) -> Te
 
 
 def torchrl_recipe(rows: TensorDict, batch: int, hidden: list[int]) -> Callable[[], object]:
-    """An update as TorchRL's own recipe makes it."""
+    """An update as in TorchRL's own SAC recipe."""
     kept = rows.select("observation", "action", "next")
     sizes = {key: kept[key].shape[-1] for key in ("observation", "action")}
     spec = Bounded(-1, 1, shape=(sizes["action"],))
@@ -133,7 +133,7 @@ def torchrl_recipe(rows: TensorDict, batch: int, hidden: list[int]) -> Callable[
 
 
 class Peer(Child):
-    """A library in its own process and environment."""
+    """A library in its own process and virtual environment."""
 
     def __init__(self, python: Path, case: dict[str, Any]) -> None:
         super().__init__([python, Path(__file__).with_name("peer_update.py"), json.dumps(case)])
@@ -144,7 +144,7 @@ class Peer(Child):
 
 
 def measured(run: Callable[[int], object], updates: int) -> float:
-    """Milliseconds of CPU time an update."""
+    """Milliseconds of CPU time per update."""
     start = time.process_time()
     run(updates)
     return 1e3 * (time.process_time() - start) / updates
