@@ -1,4 +1,4 @@
-"""Synergies of a policy that has learned a task: an upper bound for explored ones.
+"""Synergies of a policy that has learned a task: the best case for explored ones.
 
     python studies/learned_synergies.py runs/SAC_RUN learned/hand_pose --num-synergies 8
 

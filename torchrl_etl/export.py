@@ -36,7 +36,7 @@ _GROUPS = {
 }
 """Groups of the configuration, and the setting that identifies the chosen file."""
 
-# Settings of location, display and resources, which do not affect the policy.
+# Settings left out of the command: location, display, resources, and the path of a bundle.
 _OF_THE_PLACE = ("run_dir", "resume", "log", "logger_kwargs", "log_every", "progress", "pictures")
 _OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed")
 

@@ -17,7 +17,7 @@ class AnalyticOveractuated(gym.Env):
     """Many muscles drive few joints towards a goal, through a fixed linear map.
 
     This is the paper's setting reduced to its core. Only the projection of the action on a known
-    ``num_joints``-dimensional subspace has an effect, so the task is easy within this subspace.
+    ``num_joints``-dimensional subspace moves joints, so the task is easy within this subspace.
     Uniform random actions on 16 muscles drive a joint at a sixth (root mean square) of the drive
     that coordinated actions reach, and their effects average out.
 
