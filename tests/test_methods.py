@@ -30,7 +30,7 @@ RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.en
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_file_names_itself_and_makes_stages(method, tmp_path):
+def test_every_method_file_names_itself_and_builds_an_experiment(method, tmp_path):
     made = tiny(f"method={method}", "run_dir=unused", ELBOW)
     assert made.method.name == method
     if made.synergies.bundle is not None:  # of the body, or made by a script of studies/
@@ -44,7 +44,7 @@ def test_a_file_names_itself_and_makes_stages(method, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["sac", "lattice"])
-def test_methods_without_synergies_take_any_body_and_any_number_of_synergies(method):
+def test_methods_without_synergies_ignore_num_synergies(method):
     for number in ("null", "8"):
         made = tiny(
             f"method={method}", "env=cheetah-run", f"num_synergies={number}", "run_dir=unused"
@@ -52,7 +52,7 @@ def test_methods_without_synergies_take_any_body_and_any_number_of_synergies(met
         Experiment(made).method.stage()
 
 
-def test_etl_takes_half_of_a_small_body_s_actuators_and_says_so():
+def test_etl_defaults_to_half_the_actuators_of_a_small_body():
     said = []
     made = Experiment(
         tiny("env=cheetah-run", "num_synergies=null", "run_dir=unused"), say=said.append
@@ -61,7 +61,7 @@ def test_etl_takes_half_of_a_small_body_s_actuators_and_says_so():
     assert said == ["num_synergies is 3, as cheetah-run has 6 actuators."]
 
 
-def test_etl_takes_eight_of_a_large_body_s_and_says_nothing():
+def test_etl_defaults_to_eight_synergies_for_a_large_body():
     said = []
     made = Experiment(tiny("num_synergies=null", "run_dir=unused"), say=said.append)
     assert made.config.num_synergies == 8 and not said  # of 16 actuators
@@ -101,7 +101,7 @@ PUBLISHED = {
 
 
 @pytest.mark.parametrize("method", PUBLISHED)
-def test_presets_of_papers_have_the_published_numbers(method):
+def test_paper_presets_have_the_published_values(method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         made = compose("config", overrides=[f"method={method}"])
     values = {key: OmegaConf.select(made, key) for key in PUBLISHED[method]}
@@ -109,14 +109,14 @@ def test_presets_of_papers_have_the_published_numbers(method):
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name.endswith("_paper")])
-def test_presets_of_papers_learn_on_the_reward_itself(method):
+def test_paper_presets_do_not_scale_rewards(method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("config", overrides=[f"method={method}"]).learn.reward_scale == 1.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", RIVALS)
-def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
+def test_baseline_charges_its_frames_and_resumes_with_the_same_numbers(
     method, tmp_path, monkeypatch
 ):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -149,7 +149,7 @@ def test_a_rival_runs_charges_its_frames_and_goes_on_with_the_same_numbers(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["dynsyn", "eme", "lattice", "lattice_plain"])
-def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method, traced_only):
+def test_baseline_losses_and_actors_trace_as_one_graph(method, traced_only):
     stage = method_stage(method)
     fill(stage)
     inputs, gradients = stage.learner.inputs(stage.samples(1))[0], stage.learner.gradients
@@ -173,7 +173,7 @@ def test_losses_and_actors_of_a_rival_s_own_are_traced_as_one_graph(method, trac
         ("eme learn.n_steps=3", "learn.n_steps is 3, but with method=eme bonus and metric are of"),
     ],
 )
-def test_a_setting_that_a_method_would_not_heed_is_refused(setting, message, tmp_path):
+def test_setting_that_a_method_ignores_is_refused(setting, message, tmp_path):
     method, override = setting.split()
     with pytest.raises(ValueError) as caught:
         Experiment(tiny(f"method={method}", override, f"run_dir='{tmp_path}/run'"))
@@ -181,20 +181,20 @@ def test_a_setting_that_a_method_would_not_heed_is_refused(setting, message, tmp
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_of_before_that_holds_such_a_setting_goes_on_with_what_it_ran_with(tmp_path):
+def test_resume_of_an_older_run_corrects_a_setting_its_method_ignores(tmp_path):
     of_before = tiny("method=lattice", "learn.noise.kind=held")
     assert Experiment(of_before, resume=tmp_path).config.learn.noise.kind == "independent"
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_file_holds_the_settings_that_its_method_can_have(method):
+def test_method_file_holds_the_fixed_settings_of_its_method(method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         made = compose("config", overrides=[f"method={method}"])
     for key, value, _ in CLASSES[made.method.kind].fixed:
         assert OmegaConf.select(made, key) == value
 
 
-def test_a_method_without_synergies_says_that_nothing_is_explored_or_prefilled():
+def test_config_without_synergies_has_no_exploration_or_prefill():
     config = Experiment(tiny("method=sac", "learn.prefill=true", "run_dir=unused")).config
     assert (config.exploration.kind, config.synergies.kind, config.learn.prefill) == (
         None,
@@ -203,14 +203,14 @@ def test_a_method_without_synergies_says_that_nothing_is_explored_or_prefilled()
     )
 
 
-def test_eme_measures_with_the_discount_of_its_learner(tmp_path):
+def test_eme_metric_uses_the_discount_of_the_learner(tmp_path):
     settings = ("method=eme", "learn.sac.gamma=0.83", f"run_dir='{tmp_path}/run'")
     objective = Experiment(tiny(*settings)).method.stage().learner.objective
     assert objective.terms[0].loss.gamma == 0.83
     assert objective.sac.value_estimator.gamma.item() == pytest.approx(0.83)
 
 
-def test_eme_saves_the_units_of_its_bonus(tmp_path):
+def test_eme_state_dict_holds_the_scale_of_its_bonus(tmp_path):
     stage = Experiment(tiny("method=eme", f"run_dir='{tmp_path}/run'")).method.stage()
     (bonus,) = stage.learner.objective.transforms
     assert bonus.deviation is not None
@@ -254,7 +254,7 @@ def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_pa
         ("sar method.options.num_synergies=0", "method.options.num_synergies is 0"),
     ],
 )
-def test_an_option_that_cannot_be_used_is_named_in_full_before_the_run(setting, message, tmp_path):
+def test_invalid_method_option_is_refused_before_the_run(setting, message, tmp_path):
     method, override = setting.split()
     with pytest.raises(ValueError) as caught:
         Experiment(tiny(f"method={method}", ELBOW, f"run_dir='{tmp_path}/run'", override))
@@ -267,7 +267,7 @@ def controller(stage) -> DEPExploration:
 
 
 @pytest.mark.parametrize(("starts", "expected"), [((), 640), (("learn.learning_starts=100",), 100)])
-def test_dep_learns_from_when_it_has_acted_alone_or_is_told(starts, expected, tmp_path):
+def test_dep_learning_starts_after_dep_frames_unless_set(starts, expected, tmp_path):
     settings = ("method.options.dep_frames=640", *starts)
     workers = ("collector=process", "collector.num_workers=2", "action_repeat=2")
     run = rival("dep", tmp_path / "run", *workers, *settings, "collector.frames_per_batch=32")
@@ -278,7 +278,7 @@ def test_dep_learns_from_when_it_has_acted_alone_or_is_told(starts, expected, tm
 
 
 @pytest.mark.slow
-def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
+def test_dep_action_count_survives_a_restart_of_collection(tmp_path):
     stage = Experiment(rival("dep", tmp_path / "run", "action_repeat=2")).method.stage()
     stage.restart_collection()
     actions = stage.collect().numel()
@@ -288,7 +288,7 @@ def test_dep_counts_its_actions_before_and_after_episodes_begin_anew(tmp_path):
     stage.close()
 
 
-def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
+def test_dynsyn_saves_its_groups_and_learns_on_them(tmp_path):
     experiment = Experiment(rival("dynsyn", tmp_path / "run"))
     groups = experiment.run()["groups"]
     file = tmp_path / "run" / "muscle_groups.json"
@@ -307,7 +307,7 @@ def test_dynsyn_learns_on_the_groups_that_it_found(tmp_path):
     assert stage.learner.objective.sac.target_entropy == -len(set(groups))
 
 
-def test_shuffled_groups_are_dynsyn_s_dealt_to_other_muscles(tmp_path):
+def test_shuffled_groups_keep_the_group_sizes_of_dynsyn(tmp_path):
     kind = "method.kind=studies.shuffled_groups:ShuffledGroups"
     found, dealt = (
         Experiment(rival("dynsyn", tmp_path / name, *more)).method
@@ -317,7 +317,7 @@ def test_shuffled_groups_are_dynsyn_s_dealt_to_other_muscles(tmp_path):
     assert sorted(groups[0]) == sorted(groups[1]) and groups[0] != groups[1]
 
 
-def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
+def test_dynsyn_amplitude_schedule_scales_with_the_budget(tmp_path):
     stage = Experiment(rival("dynsyn", tmp_path / "run")).method.stage()
     network = stage.learner.actor[0].module
     assert stage.budget == 408  # 608 without the recording; a third of it is 136
@@ -329,7 +329,7 @@ def test_dynsyn_lets_members_deviate_within_the_budget_of_any_run(tmp_path):
 
 
 @pytest.mark.slow
-def test_dynsyn_evaluates_with_the_deviations_of_the_last_batch(tmp_path):
+def test_dynsyn_evaluates_with_the_amplitude_of_the_last_batch(tmp_path):
     experiment = Experiment(rival("dynsyn", tmp_path / "run"))
     experiment.run()
     stage = experiment.learned()
@@ -337,14 +337,14 @@ def test_dynsyn_evaluates_with_the_deviations_of_the_last_batch(tmp_path):
     assert 0.08 < network.amplitude <= 0.1  # that of the last batch's first frame
 
 
-def test_the_papers_dynsyn_deviates_as_published(tmp_path):
+def test_dynsyn_paper_preset_has_the_published_amplitude(tmp_path):
     made = tiny("method=dynsyn_paper", ELBOW, f"run_dir='{tmp_path}/run'", "learn.frames=3000000")
     network = Experiment(made).method.stage().learner.actor[0].module
     set_frames(network, 2_000_000)
     assert network.amplitude.item() == pytest.approx(0.05)
 
 
-def test_options_for_legs_and_hands_follow_the_root_of_the_body(tmp_path):
+def test_leg_and_hand_options_are_chosen_by_the_body(tmp_path):
     of_the_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.of_the_body
     assert of_the_body({"legs": 1.0, "hands": 0.66}) == 1.0
     assert of_the_body(0.5) == 0.5
@@ -353,7 +353,7 @@ def test_options_for_legs_and_hands_follow_the_root_of_the_body(tmp_path):
     assert Experiment(one_number).method.amplitude == 5
 
 
-def test_a_rival_has_no_stage_to_choose_and_no_synergies_to_take(tmp_path):
+def test_stage_and_bundle_are_refused_without_synergies(tmp_path):
     for override in ("stage=learn", "synergies.bundle=somewhere"):
         with pytest.raises(ValueError, match="method=sac has one stage and no synergies"):
             Experiment(tiny("method=sac", override, f"run_dir='{tmp_path}/run'"))

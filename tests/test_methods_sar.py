@@ -24,7 +24,7 @@ def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorD
     return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
 
 
-def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
+def test_finished_episodes_are_found_with_their_returns():
     far = 5 + (2 << 32)  # an episode of another machine
     rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
     found = finished_episodes(rows)
@@ -33,7 +33,7 @@ def test_of_rollouts_the_steps_of_whole_episodes_are_found_with_their_returns():
     assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
 
 
-def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
+def test_sar_keeps_later_episodes_above_the_percentile_of_the_preview(tmp_path):
     sar = Experiment(rival("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
     # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
     # taken, and 9 is though 11 is better.
@@ -44,7 +44,7 @@ def test_sar_takes_later_episodes_above_the_percentile_of_the_preview(tmp_path):
     assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
 
 
-def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
+def test_play_rollouts_are_new_whole_episodes_without_updates(tmp_path):
     sar = Experiment(rival("sar", tmp_path / "run", "learn.sac.normalize_observations=true")).method
     play = sar.play_stage()
     play.restart_collection()
@@ -70,9 +70,7 @@ def test_rollouts_of_play_are_new_whole_episodes_and_learn_nothing(tmp_path):
     )
 
 
-def test_sar_leaves_a_bundle_of_its_components_which_nothing_of_the_run_reads(
-    tmp_path, monkeypatch
-):
+def test_sar_saves_a_bundle_that_its_run_does_not_read(tmp_path, monkeypatch):
     def prepared(run):
         sar = Experiment(rival("sar", run)).method
         alone(sar.prepare(StopOnSignal()))
@@ -93,7 +91,7 @@ def test_sar_leaves_a_bundle_of_its_components_which_nothing_of_the_run_reads(
 
 
 @pytest.mark.slow
-def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
+def test_sar_plays_on_another_task_of_the_same_body(tmp_path):
     run = tmp_path / "run"
     other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
     experiment = Experiment(rival("sar", run, other_task))
@@ -115,6 +113,6 @@ def test_sar_plays_another_task_of_its_body_with_the_goal_of_its_name(tmp_path):
         ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
     ],
 )
-def test_sar_objects_to_play_that_cannot_serve_before_it_begins(option, message, tmp_path):
+def test_sar_refuses_invalid_play_options(option, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         Experiment(rival("sar", tmp_path / "run", f"method.options.{option}"))

@@ -123,7 +123,7 @@ def test_shapes(batch: tuple[int, ...], components: int) -> None:
     assert gmvae.likelihood_scale.shape == (4,)
 
 
-def test_components_default_to_synergies_and_one_is_the_ordinary_vae() -> None:
+def test_components_default_to_the_latent_size_and_one_gives_a_vae() -> None:
     assert GMVAE(4, 3).num_components == 3
     vae = GMVAE(4, 3, 1, hidden=(8,))
     assert (vae.prior_loc == 0).all() and (vae.prior_scale == 1).all()
@@ -132,7 +132,7 @@ def test_components_default_to_synergies_and_one_is_the_ordinary_vae() -> None:
     assert (GMVAELoss(vae)(TensorDict({"action": action}, [6]))["component_kl"] == 0).all()
 
 
-def test_infer_takes_the_likeliest_component_of_each_action() -> None:
+def test_infer_returns_the_mean_of_the_likeliest_component() -> None:
     gmvae = GMVAE(4, 2, 3, hidden=(8,))
     action = uniform(200)
     posterior = gmvae.encode(action)
@@ -148,7 +148,7 @@ def gradient_of_log_scale(gmvae: GMVAE, action: Tensor) -> Tensor:
     return gmvae.likelihood_log_scale.grad
 
 
-def test_likelihood_scale_has_a_floor_that_can_be_left_again() -> None:
+def test_likelihood_scale_has_a_floor_and_can_grow_again() -> None:
     gmvae = GMVAE(4, 2, hidden=(8,))
     nn.init.constant_(gmvae.likelihood_log_scale, -4.5)
     torch.testing.assert_close(gmvae.likelihood_scale, torch.full((4,), -4.0).exp())
@@ -193,7 +193,7 @@ def test_a_fit_recovers_the_synergies_of_the_analytic_body(components: int) -> N
 # State encoder and latent dynamics
 
 
-def test_state_encoder_is_blind_to_the_units_of_the_whole_observation() -> None:
+def test_state_encoder_is_invariant_to_the_scale_of_the_observation() -> None:
     encoder = StateEncoder(5, 3, hidden=(64, 16), out_keys=["latent"])
     data = TensorDict({"observation": torch.randn(2, 4, 5)}, [2, 4])
     latent = encoder(data)["latent"]
@@ -217,7 +217,7 @@ def test_state_encoder_refuses_impossible_sizes() -> None:
         StateEncoder(5, 3, hidden=())
 
 
-def test_dynamics_predict_a_step_from_where_the_state_is() -> None:
+def test_dynamics_predict_a_change_of_the_embedding() -> None:
     dynamics = GaussianDynamics(3, hidden=(8,))
     for parameter in dynamics.parameters():
         nn.init.zeros_(parameter)
@@ -251,7 +251,7 @@ def test_log_prob_is_the_density_of_the_samples_in_action_units(low: float, high
         assert share == pytest.approx(torch.trapezoid(density[below], grid[below]).item(), abs=0.01)
 
 
-def test_actor_fills_mixed_bounds_and_concatenates_its_inputs() -> None:
+def test_actor_covers_mixed_bounds_and_concatenates_its_inputs() -> None:
     spec = Bounded(torch.tensor(LOW), torch.tensor(HIGH), shape=(4,))
     actor = make_actor(
         {"observation": 3, ("task", "direction"): 2}, spec, out_key=("arm", "action"), hidden=(8,)
@@ -269,7 +269,7 @@ def test_actor_fills_mixed_bounds_and_concatenates_its_inputs() -> None:
     [make_actor, make_lattice_actor, partial(make_dynsyn_actor, groups=torch.tensor([0, 1, 0, 1]))],
     ids=["plain", "lattice", "dynsyn"],
 )
-def test_actors_of_baselines_are_made_by_the_same_call_with_several_and_nested_keys(
+def test_every_make_actor_takes_several_and_nested_keys(
     make: Any,
 ) -> None:
     spec = Bounded(torch.tensor(LOW), torch.tensor(HIGH), shape=(4,))
@@ -282,7 +282,7 @@ def test_actors_of_baselines_are_made_by_the_same_call_with_several_and_nested_k
     assert spec.expand(5, 4).is_in(action)
 
 
-def test_quiet_entries_have_a_fixed_deviation_that_nothing_learns() -> None:
+def test_quiet_entries_have_a_fixed_standard_deviation() -> None:
     spec = Bounded(-1, 1, shape=(5,))
     actor = make_actor({"observation": 3}, spec, hidden=(8,), quiet=3, quiet_std=0.02)
     distribution = actor.get_dist(TensorDict({"observation": torch.randn(7, 3)}, [7]))
@@ -303,14 +303,14 @@ def test_layer_norm_follows_every_hidden_layer_or_none(layer_norm: bool) -> None
         assert norms == ([(16,), (12,)] if layer_norm else [])
 
 
-def test_a_critic_is_a_perceptron_on_its_joined_inputs() -> None:
+def test_critic_is_an_mlp_of_its_concatenated_inputs() -> None:
     critic = make_critic({"observation": 3, "direction": 2, "action": 4}, hidden=(8,))
     inputs = [torch.randn(2, 5, size) for size in (3, 2, 4)]
     joined = nn.Sequential(*critic.module)(torch.cat(inputs, -1))
     torch.testing.assert_close(critic.module(*inputs), joined)
 
 
-def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
+def test_residual_body_adds_each_block_to_its_input() -> None:
     network = make_critic({"observation": 3}, body="residual", hidden=(4, 4)).module
     first, one, two, norm, head = network
     observation = torch.randn(6, 3)
@@ -322,7 +322,7 @@ def test_a_residual_body_adds_each_block_to_what_came_before() -> None:
     torch.testing.assert_close(network(observation), head(norm(hidden)))
 
 
-def test_products_of_a_bfloat16_body_are_all_that_is_of_that_precision() -> None:
+def test_bfloat16_body_keeps_outputs_and_gradients_in_float32() -> None:
     exact = make_critic({"observation": 3}, body="residual", hidden=(16, 16)).module
     network = make_critic({"observation": 3}, body="residual_bfloat16", hidden=(16, 16)).module
     network.load_state_dict(exact.state_dict())
@@ -335,7 +335,7 @@ def test_products_of_a_bfloat16_body_are_all_that_is_of_that_precision() -> None
     assert 0 < error < 0.02 * exact(observation).std()
 
 
-def test_a_residual_body_is_of_one_width_and_known_bodies_are_named() -> None:
+def test_unequal_residual_widths_and_unknown_bodies_are_refused() -> None:
     with pytest.raises(ValueError, match=r"hidden is \[4, 8\].*one width"):
         make_critic({"observation": 3}, body="residual", hidden=(4, 8))
     with pytest.raises(ValueError, match=r"body is 'resnet'.*residual"):
@@ -343,7 +343,7 @@ def test_a_residual_body_is_of_one_width_and_known_bodies_are_named() -> None:
 
 
 @pytest.mark.parametrize("action", ["action", "synergy", ("arm", "action")])
-def test_critic_writes_a_state_action_value_whatever_the_action_is_called(action: object) -> None:
+def test_critic_writes_state_action_value_for_any_action_key(action: object) -> None:
     critic = make_critic({"observation": 3, action: 2}, hidden=(8,))
     data = critic(TensorDict({"observation": torch.randn(5, 3), action: torch.randn(5, 2)}, [5]))
     assert data["state_action_value"].shape == (5, 1)

@@ -137,7 +137,7 @@ def test_all_pairs_is_the_mean_over_every_other_sample() -> None:
 
 @pytest.mark.parametrize("samples", [2, 3, 17])
 @pytest.mark.parametrize("pairs", ["permuted", "all"])
-def test_no_sample_meets_itself_and_each_serves_equally_often(pairs: str, samples: int) -> None:
+def test_pairs_exclude_self_and_use_every_sample_equally_often(pairs: str, samples: int) -> None:
     for _ in range(20):
         partner = partners(samples, torch.device("cpu"), pairs)
         assert (partner != torch.arange(samples).unsqueeze(1)).all()
@@ -149,7 +149,7 @@ def test_permuted_pairs_change_from_call_to_call() -> None:
     assert len(draws) > 1
 
 
-def test_reward_scale_sets_the_unit_and_is_saved() -> None:
+def test_reward_scale_multiplies_rewards_and_is_saved() -> None:
     data = transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3)
     loss = BehavioralMetricLoss(table(*ROWS), regularizer="none")
     loss.reward_scale = 10.0
@@ -181,7 +181,7 @@ def test_gaussian_divergence_by_hand() -> None:
     assert out["loss_dynamics"].item() == pytest.approx(0.5 * square + log_two_pi, rel=1e-5)
 
 
-def test_gaussian_divergence_lives_in_the_targets_space() -> None:
+def test_gaussian_divergence_uses_the_target_embedding() -> None:
     loss = gaussian_loss()
     for value in loss.target_encoder_params.values(True, True):
         value.mul_(2.0)
@@ -189,7 +189,7 @@ def test_gaussian_divergence_lives_in_the_targets_space() -> None:
     assert out["loss_metric"].item() == pytest.approx(0.5 * (5 - 1 - 0.5 * 20) ** 2, rel=1e-4)
 
 
-def test_dynamics_gradients_do_not_explode_where_the_spread_is_small() -> None:
+def test_dynamics_gradients_stay_moderate_for_a_small_scale() -> None:
     loc = torch.tensor([1.0, 1.0], requires_grad=True)
     scale = torch.tensor([0.5, 1e-3], requires_grad=True)
     _dynamics_nll(torch.tensor([2.0, 1.1]), loc, scale).backward()
@@ -258,6 +258,6 @@ def test_plain_networks_are_refused() -> None:
         BehavioralMetricLoss(nn.Linear(2, 2))
 
 
-def test_one_transition_has_no_pairs() -> None:
+def test_batch_of_one_transition_is_refused() -> None:
     with pytest.raises(ValueError, match="at least two"):
         BehavioralMetricLoss(table(*ROWS))(transitions([0], [1], [0.0], [False], 3))

@@ -45,7 +45,7 @@ class TestDecoderLossWithResidual(TestDecoderLoss):
     residual = 0.3
 
 
-def test_by_hand() -> None:
+def test_loss_by_hand() -> None:
     network = nn.Linear(1, 2, bias=False)
     network.weight.data = torch.tensor([[1.0], [2.0]])
     decoder = TensorDictModule(network, in_keys=["z"], out_keys=["muscles"])
@@ -57,7 +57,7 @@ def test_by_hand() -> None:
     assert DecoderLoss(decoder)(data)["loss_decoder"].item() == pytest.approx((5 + 9) / 2)
 
 
-def test_fresh_pairs_give_no_gradient_and_stale_ones_pull_back() -> None:
+def test_fresh_pairs_give_no_gradient_and_stale_pairs_undo_drift() -> None:
     decoder = SynergyDecoder(SYNERGIES, ACTION_DIM, hidden=(16,))
     data = TensorDict({"synergy": 2 * torch.rand(64, SYNERGIES) - 1}, [64])
     with torch.no_grad():

@@ -81,7 +81,7 @@ def test_latents_are_sampled_inside_the_loss() -> None:
     assert loss(data)["loss_gmvae"] != loss(data)["loss_gmvae"]
 
 
-def test_usage_entropy_tells_collapse_from_even_use() -> None:
+def test_component_entropy_distinguishes_collapse_from_even_use() -> None:
     gmvae = GMVAE(ACTION_DIM, LATENT_DIM, 4, hidden=(8,))
     head = [module for module in gmvae.encoder.modules() if isinstance(module, nn.Linear)][-1]
     nn.init.zeros_(head.weight), nn.init.zeros_(head.bias)
@@ -95,7 +95,7 @@ def test_usage_entropy_tells_collapse_from_even_use() -> None:
     assert collapsed["component_kl"].item() == pytest.approx(math.log(4), rel=1e-5)
 
 
-def test_training_recovers_synergies_that_are_there() -> None:
+def test_training_recovers_planted_synergies() -> None:
     mixing = torch.randn(LATENT_DIM, ACTION_DIM)
     action = torch.tanh(0.7 * torch.randn(512, LATENT_DIM) @ mixing)
     gmvae = GMVAE(ACTION_DIM, LATENT_DIM, hidden=(32,))
@@ -113,7 +113,7 @@ def test_training_recovers_synergies_that_are_there() -> None:
     assert 1 - residual / (action - action.mean(0)).square().sum() > 0.8
 
 
-def test_a_reset_redraws_the_prior_too() -> None:
+def test_reset_parameters_redraws_the_prior() -> None:
     loss = GMVAELoss(GMVAE(ACTION_DIM, LATENT_DIM, low=0.0, high=2.0))
     before = loss.gmvae_params["prior_loc"].detach().clone()
     loss.reset_parameters_recursive()

@@ -82,7 +82,7 @@ def test_losses_by_hand(norm: str, step: tuple, bonus: float, room: float) -> No
     assert out["multiplier"].item() == pytest.approx(30.0)
 
 
-def test_epsilon_bounds_each_transition_before_the_mean_is_taken() -> None:
+def test_epsilon_caps_each_transition_before_averaging() -> None:
     loss = METRALoss(table(*ROWS), epsilon=0.5, lambda_init=2.0, reduction="none")
     out = loss(transitions([0, 1], [1, 2], DIRECTION * 2, 3))
     expected = torch.tensor([-(5 - 2 * 24.0), -(0.5 + 2 * 0.5)])
@@ -95,9 +95,7 @@ def test_steps_against_the_direction_earn_a_negative_bonus() -> None:
 
 
 @pytest.mark.parametrize(("step", "rises"), [(LONG, True), (SHORT, False)])
-def test_lambda_rises_where_steps_are_too_long_and_falls_where_they_are_not(
-    step: tuple, rises: bool
-) -> None:
+def test_lambda_rises_for_long_steps_and_falls_for_short_ones(step: tuple, rises: bool) -> None:
     loss = METRALoss(table(*ROWS))
     optimizer = torch.optim.SGD([loss.log_lambda], lr=1.0)
     data = transitions(*step, DIRECTION, 3)
@@ -109,7 +107,7 @@ def test_lambda_rises_where_steps_are_too_long_and_falls_where_they_are_not(
     assert loss(data)["multiplier"] > 0
 
 
-def test_embeddings_gain_nothing_by_more_room_than_epsilon() -> None:
+def test_slack_beyond_epsilon_gives_no_gradient() -> None:
     loss = METRALoss(table(*ROWS), epsilon=0.5)
     loss(transitions(*SHORT, DIRECTION, 3))["loss_representation"].backward()
     gradient = next(loss.encoder_params.parameters()).grad
@@ -122,7 +120,9 @@ def test_embeddings_gain_nothing_by_more_room_than_epsilon() -> None:
     ("norm", "lambda_init", "length"),
     [("sum", 30.0, 1.0), ("sum", 0.1, 1.0), ("mean", 30.0, 2**0.5)],
 )
-def test_steps_on_a_chain_come_to_the_bound(norm: str, lambda_init: float, length: float) -> None:
+def test_steps_on_a_chain_converge_to_the_bound(
+    norm: str, lambda_init: float, length: float
+) -> None:
     states = 5
     rows = (0.1 * torch.randn(states, 2)).tolist()
     loss = METRALoss(table(*rows), norm=norm, lambda_init=lambda_init)
@@ -144,7 +144,7 @@ def test_steps_on_a_chain_come_to_the_bound(norm: str, lambda_init: float, lengt
     assert apart == pytest.approx((states - 1) * length, rel=0.05)
 
 
-def test_lambda_is_part_of_the_state_and_starts_again_on_reset() -> None:
+def test_lambda_is_saved_and_reset_to_its_initial_value() -> None:
     loss = METRALoss(table(*ROWS), lambda_init=7.0)
     other = METRALoss(table(*ROWS))
     other.load_state_dict(loss.state_dict())
@@ -173,6 +173,6 @@ def test_plain_networks_are_refused() -> None:
         METRALoss(nn.Linear(2, 2))
 
 
-def test_direction_of_another_size_is_refused_with_both_sizes() -> None:
+def test_direction_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match="has 2 dimensions but the direction has 1"):
         METRALoss(table(*ROWS))(transitions(*LONG, [[1.0]], 3))

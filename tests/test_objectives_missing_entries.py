@@ -30,7 +30,7 @@ def sac(decoder: SynergyDecoder) -> SynergySACLoss:
 
 
 @pytest.mark.parametrize("make", [sac, DecoderLoss, lambda decoder: GMVAELoss(GMVAE(16, 3))])
-def test_a_rollout_without_actions_is_told_what_makes_them(make):
+def test_missing_action_error_names_a_transform_that_provides_it(make):
     decoder = SynergyDecoder(3, 16)
     loss, data = make(decoder), rollout(decoder)
     with pytest.raises(KeyError, match=r"reads 'action'.*; RenameTransform.* makes one"):
@@ -47,7 +47,7 @@ def test_a_rollout_without_actions_is_told_what_makes_them(make):
         (BehavioralMetricLoss, ("next", "terminated")),
     ],
 )
-def test_a_missing_entry_is_named(make, missing):
+def test_missing_entry_is_named(make, missing):
     data = rollout(SynergyDecoder(3, 16)).set("direction", torch.zeros(9, 2))
     loss = make(StateEncoder(6, 2))
     loss(data)

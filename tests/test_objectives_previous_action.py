@@ -25,7 +25,7 @@ def sac_loss(key):
 
 
 @pytest.mark.parametrize("make", [decoder_loss, sac_loss])
-def test_root_executed_action_is_warned_of(make):
+def test_root_executed_action_warns(make):
     with pytest.warns(UserWarning, match="'executed_action' at the root"):
         make("executed_action")
 
@@ -34,7 +34,7 @@ def test_root_executed_action_is_warned_of(make):
     ("make", "key"),
     [(decoder_loss, "action"), (decoder_loss, ("next", "executed_action")), (sac_loss, "action")],
 )
-def test_the_action_of_the_same_step_is_read_without_a_word(make, key):
+def test_action_of_the_same_step_does_not_warn(make, key):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         make(key)

@@ -77,7 +77,7 @@ class TestLeanSACLoss(synergy.TestSynergySACLoss):
         },
     ],
 )
-def test_values_and_gradients_are_those_of_torchrls_loss(options: dict[str, Any]) -> None:
+def test_values_and_gradients_equal_torchrls_loss(options: dict[str, Any]) -> None:
     torch.manual_seed(SEED)
     theirs, ours = make_loss(SACLoss, **options), make_loss(**options)
     if options.get("delay_qvalue", True):
@@ -107,7 +107,7 @@ def test_values_and_gradients_are_those_of_torchrls_loss(options: dict[str, Any]
             assert gradients[1][name].grad is None, name
 
 
-def test_what_it_cannot_do_is_refused() -> None:
+def test_unsupported_arguments_are_refused() -> None:
     loss = make_loss()
     actor, critic = loss.actor_network, loss.qvalue_network
     with pytest.raises(TypeError, match="skip_done_states is given"):
@@ -121,7 +121,7 @@ def test_what_it_cannot_do_is_refused() -> None:
         LeanSACLoss(nn.Linear(2, 5), critic)
 
 
-def test_a_support_is_refused_beside_returns_of_many_steps() -> None:
+def test_support_with_multi_step_value_estimators_is_refused() -> None:
     loss = make_loss(bins=11, support=torch.linspace(-5.0, 5.0, 11))
     loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     for kind in (ValueEstimators.TD1, ValueEstimators.TDLambda):
@@ -130,7 +130,7 @@ def test_a_support_is_refused_beside_returns_of_many_steps() -> None:
 
 
 @pytest.mark.parametrize(("bins", "entries"), [(11, None), (1, 11), (7, 11)])
-def test_critics_of_another_size_than_the_support_are_one_sentence(
+def test_critic_size_that_differs_from_the_support_is_refused(
     bins: int, entries: int | None
 ) -> None:
     support = None if entries is None else torch.linspace(-5.0, 5.0, entries)
@@ -221,13 +221,13 @@ def assert_same_numbers(actor: Any, critic: Any, data: TensorDict) -> None:
 
 
 @pytest.mark.parametrize("make", [sequence, two_outputs, keyword_inputs, hooked])
-def test_critics_of_any_make_give_the_numbers_of_torchrls_loss(make: Any) -> None:
+def test_custom_critics_give_the_values_of_torchrls_loss(make: Any) -> None:
     actor = make_loss().actor_network
     torch.manual_seed(SEED)
     assert_same_numbers(actor, make(), TestLeanSACLoss().data((8,)))
 
 
-def test_a_composite_action_under_one_key_gives_the_numbers_of_torchrls_loss() -> None:
+def test_composite_action_under_one_key_gives_the_values_of_torchrls_loss() -> None:
     torch.manual_seed(SEED)
     data = TestLeanSACLoss().data((8,))
     left, right = data["action"].split([2, 3], -1)
@@ -236,18 +236,18 @@ def test_a_composite_action_under_one_key_gives_the_numbers_of_torchrls_loss() -
     assert_same_numbers(composite_actor(), critic, data)
 
 
-def test_counted_entropy_of_another_actor_than_a_tanh_gaussian_is_refused() -> None:
+def test_counted_entropy_requires_a_tanh_gaussian_actor() -> None:
     with pytest.raises(ValueError, match="counted is 1, but the actor is no tanh-Gaussian"):
         LeanSACLoss(composite_actor(), make_critic({"observation": 3, "action": 2}), counted=1)
 
 
-def test_a_composite_action_under_several_keys_is_refused() -> None:
+def test_composite_action_under_several_keys_is_refused() -> None:
     actor = composite_actor(name_map={"left": "left", "right": "right"})
     with pytest.raises(ValueError, match=r"The actor samples \['left', 'right'\]"):
         LeanSACLoss(actor, keyword_inputs())
 
 
-def test_a_critic_of_several_outputs_needs_one_that_is_named_as_the_value() -> None:
+def test_critic_with_several_outputs_must_write_the_value_key() -> None:
     actor, critic = make_loss().actor_network, two_outputs()
     loss = LeanSACLoss(actor, critic, target_entropy=-1.0)
     with pytest.raises(ValueError, match="let one of them be 'q'"):
@@ -259,7 +259,7 @@ def test_a_critic_of_several_outputs_needs_one_that_is_named_as_the_value() -> N
 
 
 @pytest.mark.parametrize("rate", [{"tau": 0.1}, {"eps": 0.9}])
-def test_targets_move_as_with_torchrls_updater(rate: dict[str, float]) -> None:
+def test_fused_soft_update_equals_torchrls_soft_update(rate: dict[str, float]) -> None:
     def moved(kind: type[SoftUpdate]) -> TensorDict:
         torch.manual_seed(SEED)
         loss = BehavioralMetricLoss(StateEncoder(4, 2, hidden=(8, 8)))
@@ -279,7 +279,7 @@ def test_targets_move_as_with_torchrls_updater(rate: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     ("options", "fixed_point"), [({}, 10.0), ({"loss_function": "smooth_l1"}, 1 / 9)]
 )
-def test_a_critic_of_terminal_transitions_has_the_fixed_point_of_its_loss_function(
+def test_critic_of_terminal_transitions_converges_to_the_minimum(
     options: dict[str, Any], fixed_point: float
 ) -> None:
     """One in ten pays 100: the mean is 10; smooth-L1's minimum is where 9 q = 1."""
@@ -299,7 +299,7 @@ def test_a_critic_of_terminal_transitions_has_the_fixed_point_of_its_loss_functi
     torch.testing.assert_close(values, torch.full_like(values, fixed_point), rtol=0.02, atol=0.01)
 
 
-def test_squared_error_is_the_square_itself_summed_over_critics() -> None:
+def test_squared_error_has_no_factor_half_and_sums_over_critics() -> None:
     """Stable-Baselines3 takes half of it."""
     loss = make_loss()
     SoftUpdate(loss, tau=0.1)

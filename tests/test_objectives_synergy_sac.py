@@ -108,12 +108,12 @@ class TestWithoutVmap(TestSynergySACLoss):
 # Keys and wiring
 
 
-def test_in_keys_are_what_is_read_in_a_fixed_order() -> None:
+def test_in_keys_have_a_fixed_order() -> None:
     following = [("next", key) for key in ("observation", "reward", "done", "terminated")]
     assert make_loss().in_keys == ["observation", "action", *following]
 
 
-def test_the_fresh_synergy_may_go_elsewhere() -> None:
+def test_action_key_does_not_change_the_losses() -> None:
     loss, data = make_loss(), make_data()
     outs = []
     for key in ("synergy", ("fresh", "coefficients")):
@@ -123,7 +123,7 @@ def test_the_fresh_synergy_may_go_elsewhere() -> None:
     assert_close(*outs)
 
 
-def test_a_sample_that_the_critic_reads_is_refused() -> None:
+def test_action_key_that_the_critic_reads_is_refused() -> None:
     with pytest.raises(ValueError, match="could not be told from a fresh one"):
         make_loss().set_keys(action="action")
     decoder = SynergyDecoder(SYNERGIES, ACTION)
@@ -144,7 +144,9 @@ def test_a_sample_that_the_critic_reads_is_refused() -> None:
         ({"in_keys": ["loc"]}, "synergy", "action"),  # the actor writes it, but it is no sample
     ],
 )
-def test_wrong_wiring_is_refused(keys: dict[str, Any], sample: str, reads: str) -> None:
+def test_decoder_that_does_not_connect_actor_and_critic_is_refused(
+    keys: dict[str, Any], sample: str, reads: str
+) -> None:
     decoder = SynergyDecoder(SYNERGIES, ACTION, **keys)
     with pytest.raises(ValueError, match=r"The decoder maps .* input must be the actor's sample"):
         SynergySACLoss(
@@ -154,7 +156,7 @@ def test_wrong_wiring_is_refused(keys: dict[str, Any], sample: str, reads: str) 
         )
 
 
-def test_several_decoder_keys_plain_networks_and_value_networks_are_refused() -> None:
+def test_invalid_decoders_and_value_networks_are_refused() -> None:
     loss = make_loss()
     actor, critic = loss.actor_network, loss.qvalue_network
     two = TensorDictModule(lambda x, y: x, in_keys=["synergy", "observation"], out_keys=["action"])

@@ -109,7 +109,7 @@ def actor_loss(loss: SynergySACLoss, data: TensorDict) -> Tensor:
     return seeded(loss.actor_loss, data)[0]
 
 
-def test_both_losses_go_through_the_decoder_as_it_is_now(loss, data) -> None:
+def test_both_losses_use_the_current_decoder(loss, data) -> None:
     seen = []
     for _ in range(2):
         actor, qvalue = actor_loss(loss, data), qvalue_loss(loss, data)
@@ -120,7 +120,7 @@ def test_both_losses_go_through_the_decoder_as_it_is_now(loss, data) -> None:
     assert seen[0][0] != seen[1][0] and seen[0][1] != seen[1][1]
 
 
-def test_the_entropy_is_that_of_the_counted_coefficients_alone(data) -> None:
+def test_entropy_includes_only_the_counted_coefficients(data) -> None:
     loss = make_loss(residual=0.5, counted=SYNERGIES)
     distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
     loc, scale = (part[..., :SYNERGIES] for part in (distribution.loc, distribution.scale))
@@ -141,7 +141,7 @@ def test_a_replayed_transition_is_valued_at_its_executed_action(loss, data) -> N
     assert (qvalue_loss(loss, data) - before).abs() > 1e-4
 
 
-def test_stale_actions_in_the_next_state_do_not_leak_into_the_target(loss, data) -> None:
+def test_stale_actions_in_the_data_do_not_change_the_losses(loss, data) -> None:
     before, actor = qvalue_loss(loss, data), actor_loss(loss, data)
     planted = data.clone()
     planted["next", "executed_action"] = torch.full((16, ACTION), 100.0)
@@ -153,7 +153,7 @@ def test_stale_actions_in_the_next_state_do_not_leak_into_the_target(loss, data)
     assert torch.equal(actor_loss(loss, planted), actor)
 
 
-def test_actor_gradient_is_that_of_the_explicit_composition(loss, data) -> None:
+def test_actor_gradient_equals_the_explicit_composition(loss, data) -> None:
     decoder = list(loss.decoder_network.parameters())
     names, actor = zip(*loss.actor_network.named_parameters(), strict=True)
     reached = torch.autograd.grad(actor_loss(loss, data), [*actor, *decoder])
@@ -181,7 +181,7 @@ def test_actor_gradient_is_that_of_the_explicit_composition(loss, data) -> None:
 
 
 @pytest.mark.parametrize("train_decoder", [True, False])
-def test_the_decoder_is_the_callers_and_stays_usable(train_decoder: bool, data) -> None:
+def test_critic_loss_leaves_the_callers_decoder_unchanged(train_decoder: bool, data) -> None:
     loss = make_loss(train_decoder=train_decoder)
     decoder = loss.decoder_network
     parameters = dict(decoder.named_parameters())
@@ -253,7 +253,7 @@ def rebuilt(loss: SynergySACLoss) -> SynergySACLoss:
 
 
 @pytest.mark.parametrize("clone", [deepcopy, lambda x: cloudpickle.loads(cloudpickle.dumps(x))])
-def test_a_copy_computes_with_its_own_parameters(clone: Any, loss, data) -> None:
+def test_copied_loss_uses_its_own_parameters(clone: Any, loss, data) -> None:
     expected = seeded(loss, data)  # used before it is copied
     copy = clone(loss)
     assert_close(seeded(copy, data), expected)
@@ -272,7 +272,7 @@ def test_the_state_dict_holds_the_decoder(loss, data) -> None:
     assert_close(seeded(rebuilt(loss), data), seeded(loss, data))
 
 
-def test_a_cast_after_use_carries_everything_along(loss, data) -> None:
+def test_cast_to_double_after_use(loss, data) -> None:
     before = seeded(loss, data).double()
     loss.double()
     double = data.apply(lambda x: x.double() if x.is_floating_point() else x)
