@@ -42,7 +42,7 @@ def opened(finished):
     return open_run(finished)
 
 
-def test_a_run_of_both_stages_can_be_moved_by_its_policy_by_sliders_and_along_directions(opened):
+def test_run_of_both_stages_offers_policy_sliders_and_explorer(opened):
     assert opened.drivers == ["policy", "sliders", "explorer"]
     assert opened.decoder.num_synergies == 2 and opened.direction_dim > 0
     with Session(opened) as session:
@@ -52,7 +52,7 @@ def test_a_run_of_both_stages_can_be_moved_by_its_policy_by_sliders_and_along_di
             session.step()
 
 
-def test_an_untrained_policy_is_the_run_s_own_before_its_first_frame(finished):
+def test_untrained_policy_is_that_of_the_run_before_stage_2(finished):
     def weights(policy):
         return torch.cat([value.flatten().float() for value in policy.state_dict().values()])
 
@@ -68,7 +68,7 @@ def test_an_untrained_policy_is_the_run_s_own_before_its_first_frame(finished):
         assert torch.equal(value, decoder[key]), "the synergies that learning began with"
 
 
-def test_episode_0_of_a_run_is_the_first_that_it_is_evaluated_on(opened, finished):
+def test_episode_0_is_the_first_evaluation_episode(opened, finished):
     experiment = Experiment(OmegaConf.load(finished / "config.yaml"), resume=finished)
     found = experiment.evaluator(experiment.learned())()
     with Session(opened) as session:
@@ -77,7 +77,7 @@ def test_episode_0_of_a_run_is_the_first_that_it_is_evaluated_on(opened, finishe
     assert session.total_reward == pytest.approx(found.returns[0], rel=1e-5)
 
 
-def test_a_run_that_has_explored_only_is_moved_by_sliders_and_along_directions(finished, tmp_path):
+def test_run_without_stage_2_offers_sliders_and_explorer(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / "learn")
     assert open_run(tmp_path / "run").drivers == ["sliders", "explorer"]
@@ -91,13 +91,13 @@ def test_a_run_without_policy_and_synergies_is_refused(finished, tmp_path):
         open_run(tmp_path / "run")
 
 
-def test_a_bundle_is_shown_on_the_task_that_it_was_explored_on(finished):
+def test_bundle_opens_on_the_task_of_its_exploration(finished):
     subject = open_bundle(finished)
     assert subject.drivers == ["sliders"] and subject.task.name == "overactuated"
     assert subject.decoder.residual == 0.0
 
 
-def test_an_entry_of_the_zoo_has_the_returns_of_its_card():
+def test_zoo_entry_repeats_the_first_return_on_its_card():
     subject = open_zoo("overactuated")
     with Session(subject) as session:
         while not session.over:
@@ -106,7 +106,7 @@ def test_an_entry_of_the_zoo_has_the_returns_of_its_card():
     assert session.total_reward == pytest.approx(card["episodes"]["returns"][0], rel=1e-4)
 
 
-def test_an_entry_s_synergies_are_shown_with_either_goal():
+def test_zoo_synergies_open_with_either_goal():
     with Session(open_zoo("myohand")) as session:
         assert session.subject.name == "zoo=myohand"
         for goal in ("random", "fixed"):
@@ -115,7 +115,7 @@ def test_an_entry_s_synergies_are_shown_with_either_goal():
             assert session.goal == goal and session.steps == 1
 
 
-def test_what_was_made_on_an_id_is_shown_with_either_goal(tmp_path):
+def test_run_and_bundle_of_an_environment_id_open_with_either_goal(tmp_path):
     made_on = "env=torchrl_etl/OveractuatedRandom-v0"
     short = ("explore.frames=128", "learn.frames=128", "evaluation.episodes=2")
     Experiment(tiny(f"run_dir='{tmp_path}/run'", made_on, *short)).run()
@@ -126,7 +126,7 @@ def test_what_was_made_on_an_id_is_shown_with_either_goal(tmp_path):
             session.step()
 
 
-def test_a_folder_of_synergies_alone_is_an_entry_by_its_path(finished, tmp_path):
+def test_folder_of_synergies_alone_opens_as_a_zoo_entry(finished, tmp_path):
     folder = shutil.copytree(finished / "synergies", tmp_path / "hand")
     assert open_zoo(str(folder)).drivers == ["sliders"]
     (folder / "synergies.safetensors").unlink()
@@ -134,7 +134,7 @@ def test_a_folder_of_synergies_alone_is_an_entry_by_its_path(finished, tmp_path)
         open_zoo(str(folder))
 
 
-def test_a_bundle_does_not_get_to_import_a_module(finished, tmp_path):
+def test_bundle_cannot_import_a_module(finished, tmp_path):
     folder = shutil.copytree(finished / "synergies", tmp_path / "foreign")
     info = json.loads((folder / "synergies.json").read_text())
     info["task"] = "antigravity:T-v0"
@@ -150,7 +150,7 @@ def test_a_bundle_does_not_get_to_import_a_module(finished, tmp_path):
     ("recipe", "opening"),
     [("view.py", "torchrl_etl.opened.open_zoo"), ("evaluate.py", "torchrl_etl.zoo.load")],
 )
-def test_a_simulator_s_fault_is_one_sentence(recipe, opening, fault, monkeypatch, capsys):
+def test_simulator_error_is_printed_in_one_line(recipe, opening, fault, monkeypatch, capsys):
     def fail(*arguments, **options):
         raise fault("the simulator says why")
 
@@ -165,12 +165,12 @@ def test_a_bundle_of_another_body_is_refused(finished):
         open_bundle(finished, "humanoid-stand")
 
 
-def test_what_has_no_body_to_draw_is_refused_before_anything_listens(opened):
+def test_page_of_a_task_without_mujoco_is_refused(opened):
     with Session(opened) as session, pytest.raises(ValueError, match="does not run on MuJoCo"):
         Page(session, port=0)
 
 
-def test_a_busy_port_is_refused_and_another_one_proposed():
+def test_busy_port_is_refused_with_advice():
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -179,13 +179,13 @@ def test_a_busy_port_is_refused_and_another_one_proposed():
 
 
 @pytest.mark.parametrize("port", [-1, 65536, "http", True, None])
-def test_what_is_no_port_is_refused(port):
+def test_invalid_port_is_refused(port):
     with pytest.raises(ValueError, match=r"from 0 .* to 65535"):
         check_port("127.0.0.1", port)
 
 
 @pytest.mark.parametrize("host", [None, 1, ""])
-def test_what_is_no_host_is_refused(host):
+def test_invalid_host_is_refused(host):
     with pytest.raises(ValueError, match="it must be an address to listen on"):
         check_port(host, 0)
 
@@ -205,13 +205,13 @@ def recipe():
         ({"bundle": "nowhere"}, "no synergy bundle at 'nowhere'"),
     ],
 )
-def test_view_says_in_a_sentence_what_to_name(recipe, settings, message):
+def test_view_refuses_missing_and_conflicting_settings(recipe, settings, message):
     defaults = OmegaConf.load(ROOT / "recipes" / "conf" / "view.yaml")
     with pytest.raises(ValueError, match=re.escape(message)):
         recipe.open_subject(OmegaConf.merge(defaults, settings))
 
 
-def test_view_takes_a_bundle_of_the_zoo_to_another_task_of_its_body(recipe):
+def test_view_opens_a_zoo_bundle_on_another_task_of_its_body(recipe):
     defaults = OmegaConf.load(ROOT / "recipes" / "conf" / "view.yaml")
     settings = {"bundle": "zoo:myohand", "env": "myoHandKeyTurn"}
     subject = recipe.open_subject(OmegaConf.merge(defaults, settings))
@@ -219,7 +219,7 @@ def test_view_takes_a_bundle_of_the_zoo_to_another_task_of_its_body(recipe):
 
 
 @pytest.mark.slow
-def test_view_prints_an_address_that_answers_and_ctrl_c_ends_it(tmp_path):
+def test_view_serves_the_printed_address_until_ctrl_c(tmp_path):
     names = actuator_names("cartpole-balance")
     bundle = save_bundle(
         SynergyDecoder(1, 1), tmp_path / "a bundle", task="cartpole-balance", actuators=names

@@ -51,7 +51,7 @@ def hand(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_run_leaves_everything_behind(hand):
+def test_run_folder_is_complete(hand):
     for name in (
         "config.yaml",
         "versions.json",
@@ -73,7 +73,7 @@ def test_a_run_leaves_everything_behind(hand):
 
 
 @pytest.mark.slow
-def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, capsys):
+def test_evaluate_repeats_the_return_of_the_run(hand, capsys):
     assert command("evaluate.py", f"run='{hand}'", "episodes=2") == 0
     result = json.loads((hand / "evaluation.json").read_text())
     summary = json.loads((hand / "summary.json").read_text())
@@ -81,13 +81,13 @@ def test_evaluate_writes_text_and_json_and_gives_the_run_s_own_numbers(hand, cap
     assert "95% interval" in capsys.readouterr().out
 
 
-def test_one_episode_is_told_without_an_interval(capsys):
+def test_one_episode_is_printed_without_an_interval(capsys):
     print_intervals({"return": {"mean": 2.0, "low": float("nan"), "high": float("nan")}})
     assert capsys.readouterr().out == "  return       2.000\n"
 
 
 @pytest.mark.slow
-def test_evaluate_draws_a_video_or_says_what_to_install(hand):
+def test_evaluate_writes_videos_or_asks_for_a_gl_back_end(hand):
     done = process(
         "evaluate.py",
         f"run='{hand}'",
@@ -106,7 +106,7 @@ def test_evaluate_draws_a_video_or_says_what_to_install(hand):
 
 
 @pytest.mark.slow
-def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_path):
+def test_stage_2_learns_another_task_from_a_bundle(hand, tmp_path):
     decoder, info = load_bundle(hand)  # saved again, as anybody can, without a fact about it
     bundle = save_bundle(decoder, tmp_path / "own", task=info.task, actuators=info.actuators)
     settings = ("env=myoHandKeyTurn", "stage=learn", f"synergies='{bundle}'")
@@ -118,7 +118,7 @@ def test_a_bundle_is_the_start_of_another_task_with_the_same_muscles(hand, tmp_p
 
 
 @pytest.mark.slow
-def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path, capsys):
+def test_bundle_for_other_muscles_gives_a_one_line_error(hand, tmp_path, capsys):
     settings = ("env=humanoid-stand", f"synergies='{hand}'")
     assert command("etl_sac.py", *SMALL, *settings, f"run_dir='{tmp_path}/run'") == 2
     said = capsys.readouterr().err
@@ -130,7 +130,7 @@ def test_a_bundle_for_other_muscles_is_one_sentence(hand, tmp_path, capsys):
 @pytest.mark.parametrize(
     "options", ["env=Walker2d-v5", "faithful=paper", "learn.decoder.residual=0.2"]
 )
-def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path):
+def test_both_stages_run_on_a_gymnasium_id_and_with_paper_settings(options, tmp_path):
     assert command("etl_sac.py", *TINY, options, f"run_dir='{tmp_path}/run'") == 0
     assert command("evaluate.py", f"run='{tmp_path}/run'", "episodes=2") == 0
 
@@ -169,7 +169,9 @@ def test_both_stages_run_on_other_ids_and_with_other_readings(options, tmp_path)
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],
 )
-def test_a_typo_gets_the_nearest_right_word(recipe, override, words, tmp_path, monkeypatch, capsys):
+def test_mistyped_argument_is_refused_with_advice(
+    recipe, override, words, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert command(recipe, override) != 0
     assert words in capsys.readouterr().err
@@ -184,7 +186,7 @@ def test_a_typo_gets_the_nearest_right_word(recipe, override, words, tmp_path, m
         ("sweep.py", "metods=[sac]", "did you mean methods"),
     ],
 )
-def test_a_process_ends_with_that_sentence_and_no_traceback(recipe, override, words, tmp_path):
+def test_argument_error_prints_no_traceback(recipe, override, words, tmp_path):
     done = process(recipe, override, cwd=tmp_path)
     assert done.returncode != 0
     assert words in done.stderr
@@ -192,7 +194,7 @@ def test_a_process_ends_with_that_sentence_and_no_traceback(recipe, override, wo
     assert not list(tmp_path.iterdir())
 
 
-def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
+def test_gl_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
     code = (
         "import os, sys\n"
         "from torchrl_etl.gl_backend import draw_without_display\n"
@@ -217,7 +219,7 @@ def test_the_back_end_is_chosen_before_mujoco_is_imported(tmp_path):
     ("backend", "cure"),
     [("osmesa", "libosmesa6"), ("egl", "libegl1"), ("bogus", "egl, osmesa or glfw")],
 )
-def test_a_back_end_that_cannot_be_used_is_ignored_and_the_cure_named(backend, cure):
+def test_unusable_gl_back_end_is_ignored_with_advice(backend, cure):
     code = (
         "import ctypes, os\n"
         "real = ctypes.CDLL\n"
@@ -236,7 +238,7 @@ def test_a_back_end_that_cannot_be_used_is_ignored_and_the_cure_named(backend, c
     assert f"MUJOCO_GL={backend} is ignored" in done.stderr and cure in done.stderr
 
 
-def test_a_tilde_is_the_home_folder(monkeypatch):
+def test_tilde_expands_to_the_home_folder(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     given = ["run_dir=~/runs", "resume='~/a b'", "seed=~/x"]
     assert quote_paths(given, "run_dir", "resume") == [
@@ -246,21 +248,21 @@ def test_a_tilde_is_the_home_folder(monkeypatch):
     ]
 
 
-def test_help_explains_the_settings(capsys):
+def test_help_lists_the_settings(capsys):
     assert command("etl_sac.py", "--help") == 0
     said = capsys.readouterr().out
     for word in ("stage", "synergies", "faithful", "resume", "num_envs", "kl_weight", "epsilon"):
         assert word in said
 
 
-def test_help_that_nobody_reads_to_its_end_leaves_without_a_word():
+def test_help_into_a_closed_pipe_prints_no_error():
     recipe = shlex.join([sys.executable, str(ROOT / "recipes" / "etl_sac.py")])
     done = subprocess.run(f"{recipe} --help | true", shell=True, capture_output=True, text=True)
     assert done.stderr == ""
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_leaves_and_says_how_to_go_on(tmp_path):
+def test_ctrl_c_saves_and_prints_how_to_resume(tmp_path):
     folder = tmp_path / "run"
     arguments = [*TINY, "explore.frames=100000", f"run_dir='{folder}'"]
     running = begun("etl_sac.py", *arguments, cwd=tmp_path)

@@ -52,7 +52,7 @@ def numbers(made) -> torch.Tensor:
         pytest.param(list(torch.from_numpy(ACTIONS)), id="list of tensors"),
     ],
 )
-def test_arrays_of_any_kind_give_the_numbers_of_the_tensor(use, given):
+def test_any_array_type_gives_the_result_of_a_float_tensor(use, given):
     reference = torch.from_numpy(np.array(given, np.float64)).float()
     torch.manual_seed(1)
     expected = numbers(use(gmvae(), reference))
@@ -84,7 +84,7 @@ def test_integers_and_constant_columns_give_finite_numbers(use):
         (np.ma.masked_greater(ACTIONS, 0.9), ValueError, "masked values; leave their rows out"),
     ],
 )
-def test_what_cannot_be_converted_is_refused_in_a_sentence(use, given, error, message):
+def test_unusable_array_is_refused_and_leaves_the_model_unchanged(use, given, error, message):
     model = gmvae()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     with pytest.raises(error, match=message):
@@ -100,12 +100,12 @@ def test_what_cannot_be_converted_is_refused_in_a_sentence(use, given, error, me
         ({"updates": 2, "loss": GMVAELoss(gmvae())}, "loss is of another GMVAE"),
     ],
 )
-def test_a_fit_that_would_train_nothing_is_refused(options, words):
+def test_invalid_fit_options_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
         fit_gmvae(gmvae(), ACTIONS, **options)
 
 
-def test_a_fitted_gmvae_takes_the_arrays_that_it_was_fitted_to():
+def test_gmvae_reconstructs_numpy_and_double_arrays():
     model = gmvae()
     expected = model.reconstruct(torch.from_numpy(ACTIONS).float())
     for given in (ACTIONS, torch.from_numpy(ACTIONS)):
@@ -114,7 +114,7 @@ def test_a_fitted_gmvae_takes_the_arrays_that_it_was_fitted_to():
 
 
 @pytest.mark.parametrize("use", USES[:2])
-def test_one_row_is_refused_and_rows_all_alike_are_warned_of_where_synergies_are_sought(use):
+def test_fit_refuses_one_row_and_warns_of_identical_rows(use):
     with pytest.raises(ValueError, match=r"1 row\(s\), in which no synergies"):
         use(gmvae(), ACTIONS[:1])
     with pytest.warns(UserWarning, match="9 actions are all alike"):
@@ -125,14 +125,14 @@ def test_one_action_is_enough_to_encode():
     assert SynergyDecoder.from_gmvae(gmvae()).encode(ACTIONS[0]).shape == (2,)
 
 
-def test_a_small_overshoot_of_the_bounds_is_taken():
+def test_small_overshoot_of_the_bounds_is_accepted():
     low, high = torch.zeros(4), torch.ones(4)
     assert as_actions(np.full((1, 4), 1.05), low=low, high=high).max() > 1
     with pytest.raises(ValueError, match=r"between 1\.2 and 1\.2"):
         as_actions(np.full((1, 4), 1.2), low=low, high=high)
 
 
-def test_more_rows_than_a_quantile_takes():
+def test_from_gmvae_takes_more_rows_than_torch_quantile():
     actions = torch.rand(9_000_000, 2)
     decoder = SynergyDecoder.from_gmvae(GMVAE(2, 2, 1, hidden=(2,)), actions)
     assert decoder.module.scale.isfinite().all()

@@ -29,7 +29,7 @@ def write(path, activity, names=MUSCLES, **columns):
     return path
 
 
-def test_a_csv_names_its_muscles_and_may_have_trials_and_other_columns(tmp_path):
+def test_csv_with_trials_and_ignored_columns_is_read(tmp_path):
     activity = emg(8)
     trials = ["walk"] * 4 + ["run"] * 4
     path = write(tmp_path / "emg.csv", activity, time=range(8), trial=trials)
@@ -43,7 +43,7 @@ def test_a_csv_names_its_muscles_and_may_have_trials_and_other_columns(tmp_path)
     assert read_recording(path, trial="time", leave_out=["trial"]).trials.tolist()[1] == "1"
 
 
-def test_arrays_of_numpy_are_read_in_every_form(tmp_path):
+def test_numpy_files_of_every_layout_are_read(tmp_path):
     activity, trials = emg(8), np.arange(8) // 4
     np.save(tmp_path / "plain.npy", activity)
     plain = read_recording(tmp_path / "plain.npy")
@@ -83,14 +83,14 @@ def test_arrays_of_numpy_are_read_in_every_form(tmp_path):
         ("trial\n1\n2\n", "no column that is a muscle"),
     ],
 )
-def test_a_table_that_cannot_be_used_is_one_sentence(text, words, tmp_path):
+def test_invalid_table_is_refused(text, words, tmp_path):
     path = tmp_path / "emg.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=words):
         read_recording(path)
 
 
-def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
+def test_unreadable_file_is_refused(tmp_path):
     np.save(tmp_path / "pickle.npy", np.array([{}, {}]), allow_pickle=True)
     np.save(tmp_path / "cube.npy", np.zeros((2, 3, 4)))
     np.savez(tmp_path / "two.npz", a=np.zeros((2, 3)), b=np.zeros((2, 3)))
@@ -120,7 +120,7 @@ def test_a_file_of_another_kind_is_one_sentence_and_runs_no_code(tmp_path):
             read_recording(tmp_path / name)
 
 
-def test_trials_stay_together_and_are_spread_evenly():
+def test_folds_keep_trials_together_and_are_balanced():
     trials = np.repeat(["a", "b", "c", "d"], [5, 1, 3, 1])
     parts = held_out_rows(10, folds=2, trials=trials)
     assert [set(trials[part]) for part in parts] == [{"a"}, {"b", "c", "d"}]
@@ -140,7 +140,7 @@ class Mean:
         return self.mean.expand_as(rows)
 
 
-def test_held_out_variance_is_that_of_models_that_have_not_seen_the_rows():
+def test_held_out_vaf_is_of_models_fitted_without_the_rows():
     rows = np.array([[0.0], [2.0], [4.0], [6.0]])
     found, model = cross_validate(Mean, rows, folds=2)
     # Fitted: the mean itself. Held out: 5 for 0 and 2, 1 for 4 and 6: 25 + 9 + 9 + 25 of 20.
@@ -150,7 +150,7 @@ def test_held_out_variance_is_that_of_models_that_have_not_seen_the_rows():
     assert model.mean.item() == 3.0
 
 
-def test_a_fold_of_one_row_has_a_variance_to_account_for():
+def test_fold_of_one_row_has_a_defined_vaf():
     rows = np.array([[0.0], [3.0], [6.0], [7.0]])
     found, _ = cross_validate(Mean, rows, folds=4)
     # About the mean of all, 4: 16, 1, 4 and 9. Told: 16/3, 13/3, 10/3 and 3, of the other three.
@@ -162,7 +162,7 @@ def test_a_fold_of_one_row_has_a_variance_to_account_for():
 
 
 @pytest.mark.parametrize("kind", ["nmf", "pca"])
-def test_three_sources_are_found_to_be_three(kind):
+def test_held_out_vaf_identifies_three_sources(kind):
     activity = torch.as_tensor(emg(), dtype=torch.float32)
     vaf = [
         cross_validate(lambda rows, d=d: fit_synergies(rows, kind, d, low=0.0), activity)[0]
@@ -172,7 +172,7 @@ def test_three_sources_are_found_to_be_three(kind):
     assert all(of.lowest <= of.held_out <= of.highest for of in vaf)
 
 
-def test_the_command_leaves_a_table_a_bundle_and_pictures(tmp_path, monkeypatch, capsys):
+def test_command_writes_table_bundle_and_pictures(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     path = write(tmp_path / "emg.csv", emg(), trial=[i // 60 for i in range(240)])
     settings = ("kind=nmf", "num=2..9", "vaf=0.98", "out=found")
@@ -214,9 +214,7 @@ def test_the_command_leaves_a_table_a_bundle_and_pictures(tmp_path, monkeypatch,
         (["out=emg.csv/new"], "emg.csv is a file, so out=emg.csv/new can be no folder"),
     ],
 )
-def test_a_wrong_setting_of_the_command_is_one_sentence(
-    arguments, words, tmp_path, monkeypatch, capsys
-):
+def test_invalid_setting_of_the_command_is_refused(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     path = write(tmp_path / "emg.csv", emg(20))
     assert command("synergies.py", f"data={path}", *arguments) != 0

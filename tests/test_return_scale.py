@@ -22,14 +22,14 @@ def seen(bound: float, *cuts: int) -> ReturnScale:
 
 
 @pytest.mark.parametrize("cuts", [(), (1,), (1, 3)])
-def test_scale_is_the_deviation_of_the_running_returns_or_their_largest_over_the_bound(cuts):
+def test_scale_is_the_larger_of_std_and_maximum_over_bound(cuts):
     deviation = SUMS.double().std(correction=0)
     torch.testing.assert_close(seen(100.0, *cuts).scale, deviation)
     torch.testing.assert_close(seen(2.0, *cuts).scale, torch.tensor(4.0, dtype=torch.float64))
     torch.testing.assert_close(seen(2.0)(REWARD), REWARD / 4)
 
 
-def test_an_episode_goes_on_with_its_sum_whichever_simulators_come_in_between():
+def test_running_return_follows_the_episode_across_batches():
     scale = ReturnScale(0.5, bound=1e-3)  # the largest sum decides
     going = torch.zeros(1, 2, dtype=torch.bool)
     scale.update(torch.tensor([[4.0, 4.0]]), going, torch.tensor([[7, 7]]))  # 4 and 6
@@ -40,7 +40,7 @@ def test_an_episode_goes_on_with_its_sum_whichever_simulators_come_in_between():
     assert scale.mean == (4 + 6 - 6 - 3 + 7 + 3.5) / 6
 
 
-def test_a_new_episode_of_the_same_simulator_begins_at_zero():
+def test_running_return_of_a_new_episode_starts_at_zero():
     scale = ReturnScale(0.5)
     ends = torch.tensor([[False, True]])
     scale.update(torch.tensor([[2.0, 2.0]]), ends, torch.tensor([[7, 7]]))
@@ -48,14 +48,14 @@ def test_a_new_episode_of_the_same_simulator_begins_at_zero():
     assert scale.mean == (2 + 3 + 2 + 3) / 4
 
 
-def test_forgetting_begins_new_episodes_and_keeps_the_scale():
+def test_forget_drops_running_returns_and_keeps_the_scale():
     scale = seen(2.0)
     scale.forget()
     scale.update(torch.tensor([[20.0], [0.0]]), torch.zeros(2, 1, dtype=torch.bool))
     assert scale.scale == 10.0  # not 20 + 5.5 / 2, over two
 
 
-def test_nothing_seen_or_nothing_but_zeros_leaves_rewards_as_they_are():
+def test_rewards_are_unscaled_until_a_return_is_nonzero():
     scale = ReturnScale(0.9)
     assert torch.equal(scale(REWARD), REWARD)
     scale.update(torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.bool))

@@ -14,7 +14,7 @@ SEEN = torch.tensor([[1.0, -3.0, 7.0], [2.0, 5.0, 7.0], [6.0, 1.0, 7.0], [3.0, 9
 
 
 @pytest.mark.parametrize("cuts", [(), (1,), (1, 3)])
-def test_output_is_in_deviations_from_the_mean_of_all_that_was_seen(cuts):
+def test_output_is_standardized_by_all_values_seen(cuts):
     norm = RunningNorm(3)
     for part in SEEN.tensor_split(cuts):
         norm.see(part)
@@ -22,7 +22,7 @@ def test_output_is_in_deviations_from_the_mean_of_all_that_was_seen(cuts):
     torch.testing.assert_close(norm(SEEN)[:, :2], expected[:, :2])
 
 
-def test_an_entry_that_never_varied_is_only_centred():
+def test_constant_entry_is_only_centered():
     norm = RunningNorm(3)
     norm.see(SEEN)
     assert norm(torch.tensor([0.0, 0.0, 8.0]))[2] == 1.0
@@ -44,13 +44,13 @@ def test_an_empty_batch_changes_nothing(take):
         assert torch.equal(value, before[name]), name
 
 
-def test_whole_numbers_are_normalized_as_the_same_real_ones():
+def test_integers_are_normalized_like_floats():
     norm = RunningNorm(3)
     norm.see(SEEN.long() * 3 + 1)
     assert torch.equal(norm(SEEN.long()), norm(SEEN))
 
 
-def test_nothing_seen_leaves_observations_as_they_are():
+def test_output_is_unchanged_before_any_value_is_seen():
     assert torch.equal(RunningNorm(3)(SEEN), SEEN)
 
 
@@ -60,7 +60,7 @@ def test_outliers_are_clipped():
     assert norm(SEEN + 1e6).max() == 2.0
 
 
-def test_only_seeing_changes_the_statistics_and_they_survive_a_round_trip():
+def test_statistics_change_only_in_see_and_survive_a_round_trip():
     norm, other = RunningNorm(3), RunningNorm(3)
     norm.see(SEEN)
     before = norm(SEEN)

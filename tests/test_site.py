@@ -49,7 +49,7 @@ def navigation() -> list[str]:
     return files(settings["nav"])
 
 
-def test_the_navigation_has_every_page_once_and_no_other():
+def test_navigation_lists_every_page_once():
     written = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
     assert sorted(navigation()) == sorted(written | GENERATED)
 
@@ -74,7 +74,7 @@ def site(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_site_builds_strictly_and_shows_every_public_name(site):
+def test_site_builds_strictly_with_api_links_and_gallery(site):
     overview = (site / "api" / "index.html").read_text(encoding="utf-8")
     transforms = (site / "api" / "transforms" / "index.html").read_text(encoding="utf-8")
     assert "transforms/#torchrl_etl.transforms.SynergyAction" in overview
@@ -88,7 +88,7 @@ def test_the_site_builds_strictly_and_shows_every_public_name(site):
 
 
 @pytest.mark.slow
-def test_no_markup_is_left_over_in_what_is_read(site):
+def test_prose_has_no_unrendered_markup(site):
     left = []
     for page in site.rglob("index.html"):
         if page.relative_to(site).parts[0] == "source":
@@ -117,7 +117,7 @@ def address(site) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_every_page_fits_a_phone_without_an_error_and_asks_no_other_server(request):
+def test_every_page_fits_a_phone_without_errors_or_external_requests(request):
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="the browser test needs Playwright: pip install playwright"
     )

@@ -39,7 +39,7 @@ def linear(decoder: nn.Module) -> nn.Linear:
     return layer
 
 
-def test_pca_finds_two_directions_before_the_bounds_with_their_ranges() -> None:
+def test_pca_recovers_two_directions_and_their_ranges_before_tanh() -> None:
     center, basis = torch.randn(16) / 4, torch.linalg.qr(torch.randn(16, 2)).Q.mT
     coefficients = (2 * torch.rand(20_000, 2) - 1) * torch.tensor([1.2, 0.4])
     actions = (center + coefficients @ basis).tanh()
@@ -62,7 +62,7 @@ def test_pca_of_a_known_covariance_keeps_its_larger_variance() -> None:
     torch.testing.assert_close(model.reconstruct(before.tanh()), kept.tanh(), atol=1e-6, rtol=0)
 
 
-def test_muscles_at_their_bounds_leave_the_decoder_finite() -> None:
+def test_actions_at_the_bounds_give_a_finite_decoder() -> None:
     actions = torch.ones(100, 16)
     actions[::2] = -1.0
     decoder = fit_synergies(actions, "pca", 1).decoder(actions)
@@ -71,7 +71,7 @@ def test_muscles_at_their_bounds_leave_the_decoder_finite() -> None:
     torch.testing.assert_close(ends.abs(), torch.full((2, 16), 0.99), atol=1e-4, rtol=0)
 
 
-def test_nmf_finds_the_factors_that_were_planted() -> None:
+def test_nmf_recovers_planted_factors() -> None:
     """Each source alone in some rows, and a muscle of its own: the factorization is unique."""
     parts = torch.tensor([[0.8, 0.0, 0.4, 0.2], [0.0, 0.6, 0.3, 0.9]])
     weights = torch.rand(600, 2) / 2
@@ -88,9 +88,7 @@ def test_nmf_finds_the_factors_that_were_planted() -> None:
 
 
 @pytest.mark.parametrize(("kind", "origin"), [("nmf", "low"), ("sar", "mean")])
-def test_actions_are_decoded_with_the_models_slope_in_the_middle_of_the_box(
-    kind: str, origin: str
-) -> None:
+def test_decoder_has_the_models_slope_at_mid_range(kind: str, origin: str) -> None:
     """Models of actions: a = origin + c·basis."""
     actions = activity()
     model = fitted(kind, actions)
@@ -103,7 +101,7 @@ def test_actions_are_decoded_with_the_models_slope_in_the_middle_of_the_box(
     torch.testing.assert_close(slope.mT, (ends[1] - ends[0])[:, None] / 2 * model.basis)
 
 
-def test_sar_finds_sources_that_are_independent_with_unit_variance() -> None:
+def test_sar_recovers_independent_sources_with_unit_variance() -> None:
     """Two sources of ±1 in every combination equally often; what mixes them is found."""
     signs = torch.cartesian_prod(torch.tensor([-1.0, 1.0]), torch.tensor([-1.0, 1.0])).repeat(50, 1)
     mixing = torch.tensor([[0.3, 0.1, 0.0], [0.1, -0.3, 0.2]])
@@ -118,7 +116,7 @@ def test_sar_finds_sources_that_are_independent_with_unit_variance() -> None:
     )
 
 
-def test_sar_leaves_components_without_variance_as_they_are() -> None:
+def test_sar_with_constant_components_keeps_an_orthonormal_basis() -> None:
     """One source of three muscles: of three components one varies."""
     actions = torch.rand(200, 1) @ torch.tensor([[0.5, 0.3, 0.1]])
     model = fit_synergies(actions, "sar", 3, low=0.0, high=1.0)
@@ -126,7 +124,7 @@ def test_sar_leaves_components_without_variance_as_they_are() -> None:
     torch.testing.assert_close(model.reconstruct(actions), actions, atol=1e-5, rtol=0)
 
 
-def test_a_muscle_that_rests_stays_at_rest_in_nmf() -> None:
+def test_nmf_keeps_a_resting_muscle_at_rest() -> None:
     actions = activity()
     actions[:, 3] = 0.0
     decoder = fitted("nmf", actions).decoder(actions)
@@ -135,7 +133,7 @@ def test_a_muscle_that_rests_stays_at_rest_in_nmf() -> None:
     assert moved.isfinite().all()
 
 
-def test_a_fit_of_a_gmvae_begins_anew_and_heeds_the_weights_of_its_loss() -> None:
+def test_gmvae_refit_starts_over_and_uses_the_loss_weights() -> None:
     actions, bounds = activity(), (torch.zeros(6), torch.ones(6))
 
     def rebuilt(model: SynergyModel) -> Tensor:
@@ -152,7 +150,7 @@ def test_a_fit_of_a_gmvae_begins_anew_and_heeds_the_weights_of_its_loss() -> Non
         assert not torch.equal(rebuilt(other), first)
 
 
-def test_a_vae_is_a_gmvae_of_one_component_to_the_bit() -> None:
+def test_vae_is_bit_identical_to_a_gmvae_of_one_component() -> None:
     actions = activity()
     torch.manual_seed(1)
     one = fitted("vae", actions)
@@ -163,7 +161,7 @@ def test_a_vae_is_a_gmvae_of_one_component_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("kind", SYNERGY_MODELS)
-def test_arrays_of_any_kind_are_taken_and_bad_ones_are_refused_in_a_sentence(kind: str) -> None:
+def test_any_array_type_is_fitted_and_invalid_arrays_are_refused(kind: str) -> None:
     actions = activity().double().numpy()
     decoder = fitted(kind, actions).decoder(actions)
     assert decoder.low.tolist() == [0.0] * 6 and decoder.num_synergies == 2
@@ -180,7 +178,7 @@ def test_arrays_of_any_kind_are_taken_and_bad_ones_are_refused_in_a_sentence(kin
         fit_synergies(activity(), kind, 2, low=[0.0] * 3, high=1.0)
 
 
-def test_numbers_may_be_numpys(tmp_path) -> None:
+def test_options_may_be_numpy_numbers(tmp_path) -> None:
     options = {"lr": np.float32(1e-3), "updates": np.int64(2), "hidden": [np.int64(8)]}
     model = fit_synergies(activity(), "gmvae", np.int64(2), low=0.0, high=1.0, **options)
     model.save(tmp_path / "b", activity(), task="toy", actuators=list("abcdef"))
@@ -189,13 +187,13 @@ def test_numbers_may_be_numpys(tmp_path) -> None:
         fit_synergies(activity(), "gmvae", 2, num_components=True)
 
 
-def test_an_unknown_kind_is_refused_with_the_nearest() -> None:
+def test_unknown_kind_is_refused_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="nmf"):
         fit_synergies(activity(), "nfm")
 
 
 @pytest.mark.parametrize("kind", AFFINE)
-def test_synergies_are_asked_for_before_they_are_fitted_is_said(kind: str) -> None:
+def test_use_before_fit_is_refused(kind: str) -> None:
     model = SYNERGY_MODELS[kind](torch.zeros(6), torch.ones(6), 2)
     for use in (model.decoder, model.reconstruct):
         with pytest.raises(RuntimeError, match=rf"The {kind} has no synergies yet; call fit"):
@@ -204,7 +202,7 @@ def test_synergies_are_asked_for_before_they_are_fitted_is_said(kind: str) -> No
 
 @pytest.mark.parametrize("kind", AFFINE)
 @pytest.mark.filterwarnings("ignore:The 50 actions are all alike")
-def test_actions_all_alike_give_a_finite_decoder(kind: str) -> None:
+def test_identical_actions_give_a_finite_decoder(kind: str) -> None:
     for value in (0.0, 0.3):
         actions = torch.full((50, 6), value)
         decoder = fitted(kind, actions).decoder(actions)
@@ -231,7 +229,7 @@ def test_every_kind_is_described_and_drawn_under_its_name(kind: str, tmp_path) -
     assert {file.name for file in tmp_path.iterdir()} == {"synergies.png", "vaf.png"}
 
 
-def test_a_mixture_that_has_collapsed_is_told_from_an_even_one() -> None:
+def test_describe_reports_a_collapsed_mixture() -> None:
     model = GMVAESynergies(-torch.ones(6), torch.ones(6), 2, num_components=4)
     final = model.model.encoder[-1]
     with torch.no_grad():
@@ -246,7 +244,7 @@ def test_a_mixture_that_has_collapsed_is_told_from_an_even_one() -> None:
     assert "collapsed: 1.0 of its 4 components are in use, the largest for 100%" in faults[-1]
 
 
-def test_a_mixture_of_one_component_cannot_collapse() -> None:
+def test_describe_reports_no_collapse_of_one_component() -> None:
     model = SYNERGY_MODELS["vae"](-torch.ones(6), torch.ones(6), 2)
     assert model.describe(torch.rand(10, 6)) == ({"effective_components": pytest.approx(1.0)}, [])
 
@@ -264,7 +262,7 @@ def test_both_stages_run_with_every_kind(kind: str, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", AFFINE)
-def test_what_is_fitted_once_adds_no_loss_to_stage_1(kind: str) -> None:
+def test_affine_synergies_add_no_loss_to_stage_1(kind: str) -> None:
     found = explorer(f"synergies={kind}")
     assert found.term is None and found.model.loss is None
     for _ in range(6):
@@ -276,7 +274,7 @@ def test_what_is_fitted_once_adds_no_loss_to_stage_1(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SYNERGY_MODELS)
-def test_a_bundle_of_every_kind_encodes_and_decodes_as_what_was_saved(kind: str, tmp_path) -> None:
+def test_bundle_round_trip_preserves_encode_and_decode(kind: str, tmp_path) -> None:
     actions = activity()
     model = fitted(kind, actions)
     decoder, facts = model.decoder(actions, residual=0.5), {"rows": len(actions)}
@@ -304,7 +302,7 @@ def test_encode_inverts_decode(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SYNERGY_MODELS)
-def test_log_slope_is_the_determinant_against_the_middle_of_the_range(kind: str) -> None:
+def test_log_slope_is_the_log_determinant_relative_to_mid_range(kind: str) -> None:
     actions = activity()
     decoder = fitted(kind, actions).decoder(actions, residual=0.4).double()
     for row in 2 * torch.rand(3, 8, dtype=torch.float64) - 1:
@@ -314,9 +312,7 @@ def test_log_slope_is_the_determinant_against_the_middle_of_the_range(kind: str)
 
 
 @pytest.mark.parametrize(("section", "kind"), [("synergies", "nmf"), ("exploration", "metra")])
-def test_a_kind_with_the_options_of_another_is_refused_with_the_setting_that_helps(
-    section: str, kind: str
-) -> None:
+def test_kind_with_the_options_of_another_is_refused(section: str, kind: str) -> None:
     config = tiny("run_dir=unused")
     config[section].kind = kind
     with pytest.raises(ValueError, match=rf"choose {section}={kind}, which brings its own"):

@@ -23,7 +23,7 @@ def fitted(residual: float = 0.0, **kwargs: object) -> tuple[GMVAE, SynergyDecod
     return gmvae, SynergyDecoder.from_gmvae(gmvae, actions, residual=residual, **kwargs), actions
 
 
-def test_taking_over_a_decoder_leaves_the_gmvae_untouched_bit_by_bit() -> None:
+def test_training_a_decoder_leaves_its_gmvae_unchanged() -> None:
     gmvae, decoder, actions = fitted()
     before = weights(gmvae)
     optimizer = torch.optim.Adam(decoder.parameters(), 0.1)
@@ -35,7 +35,7 @@ def test_taking_over_a_decoder_leaves_the_gmvae_untouched_bit_by_bit() -> None:
     assert not same(weights(decoder.module.decoder), inner)
 
 
-def test_decoder_is_the_gmvaes_at_the_scaled_latent() -> None:
+def test_decoder_equals_the_gmvae_at_the_scaled_latent() -> None:
     for dtype in (torch.float32, torch.float64):
         gmvae = GMVAE(4, 2, hidden=(8,)).to(dtype)
         decoder = SynergyDecoder.from_gmvae(gmvae, uniform(100).to(dtype))
@@ -85,7 +85,7 @@ def test_residual_by_hand() -> None:
     assert decoder.log_slope(synergy[0]).shape == ()
 
 
-def test_a_whole_residual_reaches_every_action_from_all_coefficients() -> None:
+def test_full_residual_reaches_every_action() -> None:
     decoder = fitted(residual=1.0)[1].double()
     wanted = uniform(500, LOW, HIGH).double()
     coefficients = torch.cat([uniform(500, dim=2), torch.zeros(500, 4)], -1).double()
@@ -96,7 +96,7 @@ def test_a_whole_residual_reaches_every_action_from_all_coefficients() -> None:
     torch.testing.assert_close(decoder(coefficients), wanted)
 
 
-def test_no_residual_is_without_effect_at_the_ends_of_the_range() -> None:
+def test_residual_keeps_its_gradient_near_saturation() -> None:
     decoder = SynergyDecoder(1, 2, hidden=(4,), residual=1.0)
     bias_of_last_layer(decoder).copy_(torch.tensor([20.0, -20.0]))  # a tanh of 1 and -1
     synergy = torch.tensor([[0.0, 0.9, -0.9], [0.0, -0.9999, 0.9999], [0.0, -1.0, 1.0]])
@@ -106,19 +106,19 @@ def test_no_residual_is_without_effect_at_the_ends_of_the_range() -> None:
     assert decoder.log_slope(synergy).isfinite().all()
 
 
-def test_a_key_by_itself_is_one_key() -> None:
+def test_keys_may_be_single_strings() -> None:
     decoder = SynergyDecoder(2, 4, in_keys="syn", out_keys="act")
     assert (decoder.in_keys, decoder.out_keys) == (["syn"], ["act"])
 
 
 @pytest.mark.parametrize("residual", [-0.1, 1.1])
-def test_residual_share_is_checked(residual: float) -> None:
+def test_residual_outside_zero_to_one_is_refused(residual: float) -> None:
     with pytest.raises(ValueError, match=r"must lie in \[0, 1\]"):
         SynergyDecoder(2, 4, residual=residual)
 
 
 @pytest.mark.parametrize("residual", [0.0, 0.3])
-def test_log_slope_is_the_determinant_of_the_residuals_jacobian(residual: float) -> None:
+def test_log_slope_is_the_log_determinant_of_the_residual(residual: float) -> None:
     decoder = fitted(residual)[1].double()
     synergy = uniform(3, dim=decoder.synergy_dim).double()
     expected = torch.zeros(3, dtype=torch.float64)
@@ -131,7 +131,7 @@ def test_log_slope_is_the_determinant_of_the_residuals_jacobian(residual: float)
 
 
 @pytest.mark.parametrize("residual", [0.0, 0.3])
-def test_config_and_state_dict_rebuild_it_bit_for_bit(residual: float) -> None:
+def test_config_and_state_dict_rebuild_the_decoder(residual: float) -> None:
     decoder = fitted(residual)[1]
     config = json.loads(json.dumps(decoder.config))
     torch.manual_seed(5)
@@ -144,7 +144,7 @@ def test_config_and_state_dict_rebuild_it_bit_for_bit(residual: float) -> None:
 
 
 @pytest.mark.parametrize(("residual", "size"), [(0.0, 2), (0.3, 6)])
-def test_synergy_spec_is_what_the_decoder_reads(residual: float, size: int) -> None:
+def test_synergy_spec_bounds_the_input_of_the_decoder(residual: float, size: int) -> None:
     keys = {"in_keys": [("arm", "synergy")], "out_keys": [("arm", "action")]}
     decoder = fitted(residual, **keys)[1]
     spec = decoder.synergy_spec
@@ -156,7 +156,7 @@ def test_synergy_spec_is_what_the_decoder_reads(residual: float, size: int) -> N
     assert ((action >= decoder.low) & (action <= decoder.high)).all()
 
 
-def test_sums_in_the_corners_stay_within_the_bounds_and_right() -> None:
+def test_tanh_sum_is_bounded_and_accurate_near_saturation() -> None:
     ends = 1 - torch.logspace(-6, -1, 200)
     for x, y in ((ends, -ends.flip(0)), (-ends, torch.ones(200)), (ends, ends), (ends, -ends)):
         found = tanh_sum(x, y)
@@ -167,7 +167,7 @@ def test_sums_in_the_corners_stay_within_the_bounds_and_right() -> None:
         torch.testing.assert_close(slope, expected)
 
 
-def test_directions_are_the_slope_at_the_center_and_bounds_hold_beyond() -> None:
+def test_from_directions_has_the_given_slope_and_stays_in_bounds() -> None:
     center = torch.tensor([0.25, 0.0, 4.0, 0.3])
     directions = torch.tensor([[1.0, 0.0, -2.0, 0.1], [0.0, 0.5, 0.0, -0.2]])
     decoder = SynergyDecoder.from_directions(center, directions, low=LOW, high=HIGH)
@@ -181,7 +181,7 @@ def test_directions_are_the_slope_at_the_center_and_bounds_hold_beyond() -> None
     assert ((far > decoder.low) & (far < decoder.high)).all()
 
 
-def test_a_decoder_of_directions_is_rebuilt_from_its_bundle(tmp_path: Path) -> None:
+def test_from_directions_survives_a_bundle_round_trip(tmp_path: Path) -> None:
     decoder = SynergyDecoder.from_directions(torch.zeros(4), torch.rand(2, 4), residual=0.5)
     save_bundle(decoder, tmp_path / "synergies", task="toy", actuators=list("abcd"))
     copy, info = load_bundle(tmp_path)
@@ -197,8 +197,6 @@ def test_a_decoder_of_directions_is_rebuilt_from_its_bundle(tmp_path: Path) -> N
         (torch.tensor([0.0, 1.0]), torch.zeros(1, 2), "Entry 1 of the center is not inside"),
     ],
 )
-def test_directions_that_do_not_fit_are_refused(
-    center: Tensor, directions: Tensor, words: str
-) -> None:
+def test_invalid_directions_are_refused(center: Tensor, directions: Tensor, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         SynergyDecoder.from_directions(center, directions)

@@ -88,7 +88,7 @@ def test_learned_distances_reach_the_fixed_point_and_its_mean() -> None:
     assert (learned - exact)[OTHERS].abs().max() < 0.1 * exact.max()
 
 
-def test_gaussian_divergence_heads_for_the_same_mean_and_does_not_run_away() -> None:
+def test_gaussian_divergence_approaches_the_same_mean() -> None:
     options = {"divergence": "gaussian", "regularizer": "none"}
     found = [
         trained_distances(SPARSE, 1500, 7e-4, seed=seed, **options)[OTHERS].mean()
@@ -101,14 +101,14 @@ def test_gaussian_divergence_heads_for_the_same_mean_and_does_not_run_away() -> 
     assert sorted(found)[1] > 0.8 * predicted
 
 
-def test_without_reward_the_plain_metric_and_the_literal_regularizer_collapse() -> None:
+def test_plain_and_literal_metrics_collapse_without_reward() -> None:
     silent = torch.zeros(STATES)
     for regularizer in ("none", "literal"):
         learned = trained_distances(silent, 600, regularizer=regularizer, weight=1.0)
         assert learned[OTHERS].mean() < 0.02, regularizer
 
 
-def test_without_reward_the_hinge_keeps_states_apart() -> None:
+def test_hinge_keeps_states_apart_without_reward() -> None:
     learned = trained_distances(torch.zeros(STATES), 500)
     # Where metric and hinge balance: (1 - gamma) d = 2 lambda (m - d), at lambda .1 and m 1.
     balance = 2 * 0.1 / (1 - GAMMA + 2 * 0.1)
