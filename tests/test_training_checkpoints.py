@@ -48,7 +48,7 @@ def test_rows_order_and_next_position_survive(filled, tmp_path):
     assert torch.equal(source.storage[:]["next", "b"], twin.storage[:]["next", "b"])
 
 
-def test_a_buffer_of_another_size_takes_the_newest_rows_in_their_order(tmp_path):
+def test_buffer_of_another_size_loads_the_newest_rows_in_order(tmp_path):
     source = buffer(4)
     for start in range(6):  # over the brim: 4 and 5 lie before 2 and 3
         source.extend(rows(start, start + 1))
@@ -81,24 +81,20 @@ def full_disk(monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", no_space)
 
 
-def test_a_buffer_in_files_that_do_not_fit_on_the_disk_says_so_at_its_first_row(
-    tmp_path, full_disk
-):
+def test_buffer_larger_than_the_disk_is_refused_at_its_first_row(tmp_path, full_disk):
     storage = make_storage(100_000, torch.device("cpu"), tmp_path / "buffer")
     with pytest.raises(OSError, match="There is no room for"):
         TensorDictReplayBuffer(storage=storage, batch_size=4).extend(rows(0, 3))
 
 
-def test_a_checkpoint_that_does_not_fit_on_the_disk_says_so_and_leaves_the_last_one(
-    tmp_path, full_disk
-):
+def test_checkpoint_larger_than_the_disk_is_refused_and_removed(tmp_path, full_disk):
     checkpoints = Checkpoints(tmp_path, keep_last=2)
     with pytest.raises(OSError, match="There is no room for"):
         checkpoints.save(Checkpoint(module=torch.nn.Linear(9, 9)), step=1)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_size_of_a_checkpoint_counts_every_tensor():
+def test_checkpoint_size_counts_every_tensor():
     module = torch.nn.Linear(3, 2)  # 8 floats
     optimizer = torch.optim.Adam(module.parameters())
     module(torch.ones(3)).sum().backward()
@@ -163,7 +159,7 @@ def saved(tmp_path) -> Checkpoints:
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_whatever_is_damaged_in_the_newest_checkpoint_the_one_before_is_taken(kind, saved):
+def test_damaged_newest_checkpoint_falls_back_to_the_one_before(kind, saved):
     second = saved.checkpoints()[-1]
     DAMAGE[kind](second)
     layer = module(0)
@@ -173,7 +169,7 @@ def test_whatever_is_damaged_in_the_newest_checkpoint_the_one_before_is_taken(ki
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_whatever_is_damaged_in_all_checkpoints_they_are_refused_and_stay(kind, saved):
+def test_damaged_checkpoints_are_refused_and_kept(kind, saved):
     for folder in saved.checkpoints():
         DAMAGE[kind](folder)
     layer = module(0)
@@ -186,7 +182,7 @@ def test_whatever_is_damaged_in_all_checkpoints_they_are_refused_and_stay(kind, 
     assert (layer.weight == 0).all() and len(saved.checkpoints()) == 2
 
 
-def test_without_damage_the_newest_is_taken_without_a_word(saved, recwarn):
+def test_undamaged_newest_checkpoint_loads_without_warning(saved, recwarn):
     layer = module(0)
     assert saved.load_newest_whole(Checkpoint(module=layer))
     assert (layer.weight == 2).all()

@@ -46,7 +46,7 @@ def refuse(graph: torch.fx.Graph) -> None:
         (a_branch_on_a_value, {}, "compile=false leaves out the attempt"),
     ],
 )
-def test_a_failed_compilation_says_why_and_gives_the_uncompiled_numbers(function, patch, words):
+def test_failed_compilation_warns_and_gives_the_uncompiled_values(function, patch, words):
     x = torch.linspace(-1, 1, 4, requires_grad=True)
     call = compiled(function)
     outs = []
@@ -61,7 +61,7 @@ def test_a_failed_compilation_says_why_and_gives_the_uncompiled_numbers(function
     assert torch.equal(torch.stack(outs), torch.stack([function(x), function(x)]))
 
 
-def test_what_two_losses_ask_for_is_computed_once_and_what_changed_between_them_anew():
+def test_compiled_losses_share_products_but_not_changed_state():
     weight = torch.randn(20, 24, requires_grad=True)
     count, graphs = torch.ones(()), []
 
@@ -81,7 +81,7 @@ def test_what_two_losses_ask_for_is_computed_once_and_what_changed_between_them_
     assert sum(node.target in kinds for node in graphs[0].nodes) == 2
 
 
-def test_two_draws_stay_two():
+def test_compiled_random_draws_are_not_merged():
     def drawn(x: torch.Tensor) -> list[torch.Tensor]:
         return [torch.randn_like(x) + 1, torch.randn_like(x) + 1, x.clone().uniform_()]
 
@@ -93,7 +93,7 @@ def test_two_draws_stay_two():
 
 
 @pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="a folder nobody can write to")
-def test_a_cache_that_cannot_be_written_is_named_with_the_variable_that_moves_it(monkeypatch):
+def test_unwritable_compile_cache_is_named_with_its_variable(monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/sys/kernel")
     x = torch.linspace(-1, 1, 4, requires_grad=True)
     with pytest.warns(RuntimeWarning, match=r"/sys/kernel.*TORCHINDUCTOR_CACHE_DIR"):
@@ -101,7 +101,7 @@ def test_a_cache_that_cannot_be_written_is_named_with_the_variable_that_moves_it
 
 
 @pytest.mark.slow
-def test_a_run_that_goes_on_and_cannot_compile_has_the_numbers_of_an_uncompiled_one(tmp_path):
+def test_resume_with_failed_compilation_equals_an_uncompiled_run(tmp_path):
     plain, resumed = tmp_path / "plain", tmp_path / "resumed"
     Experiment(tiny("method=sac", "learn.frames=608", f"run_dir='{plain}'", "compile=false")).run()
     shutil.copytree(plain, resumed)
@@ -130,7 +130,7 @@ print(run(), ThreadPoolExecutor(1).submit(run).result())
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="folders are linked as on Linux")
-def test_a_library_and_a_cache_in_folders_with_spaces_compile(tmp_path):
+def test_compilation_works_in_folders_with_spaces(tmp_path):
     spaced = tmp_path / "my folder"
     spaced.mkdir()
     (spaced / "site").symlink_to(Path(torch.__file__).parents[1])
@@ -149,7 +149,7 @@ def test_a_library_and_a_cache_in_folders_with_spaces_compile(tmp_path):
     assert str(spaced) in ran.stdout and ran.stdout.count("tensor([0.5000, 0.5000, 0.5000])") == 2
 
 
-def test_tensordicts_stay_in_pytree_beside_a_cuda_graph():
+def test_cuda_graph_keeps_tensordict_in_pytree():
     cuda_graph(lambda batch: batch)
     leaves, _ = tree_flatten(TensorDict({"a": torch.zeros(2)}, [2]))
     assert [type(leaf) for leaf in leaves] == [torch.Tensor]

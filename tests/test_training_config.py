@@ -30,7 +30,7 @@ GROUPS = {
 
 
 @pytest.mark.parametrize(("experiment", "faithful"), itertools.product(*GROUPS.values()))
-def test_every_pair_of_groups_is_valid(experiment, faithful):
+def test_every_pair_of_presets_is_valid(experiment, faithful):
     validate(tiny(f"experiment={experiment}", f"faithful={faithful}"))
 
 
@@ -124,7 +124,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("exploration.metric.regularizer=hing", "hinge"),
     ],
 )
-def test_a_fault_is_named_with_its_remedy_before_anything_runs(override, words, tmp_path):
+def test_invalid_setting_is_refused_with_its_remedy(override, words, tmp_path):
     with pytest.raises((ValueError, FileNotFoundError)) as caught:
         Experiment(tiny(f"run_dir='{tmp_path}/run'", *override.split()))
     assert words in str(caught.value)
@@ -132,7 +132,7 @@ def test_a_fault_is_named_with_its_remedy_before_anything_runs(override, words, 
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_cuda_without_a_device_says_so():
+def test_cuda_without_a_device_is_refused():
     with pytest.raises(ValueError, match="no CUDA device is available; use device=cpu"):
         Experiment(tiny("device=cuda"))
 
@@ -144,18 +144,18 @@ def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
         Experiment(tiny(f"run_dir='{tmp_path}/run'")).run()
 
 
-def test_an_unwritable_folder_is_named(tmp_path):
+def test_unwritable_run_folder_is_refused(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(OSError, match="cannot be written"):
         Experiment(tiny(f"run_dir='{tmp_path}/file/run'")).run()
 
 
-def test_resuming_what_is_no_run_is_named(tmp_path):
+def test_resume_of_a_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no run"):
         resumed_config(tmp_path)
 
 
-def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
+def test_bundle_sets_num_synergies_and_an_absolute_path(tmp_path, monkeypatch):
     decoder = SynergyDecoder(3, 16)
     names = [f"muscle_{i}" for i in range(16)]
     save_bundle(decoder, tmp_path / "bundle", task="overactuated", actuators=names)
@@ -165,7 +165,7 @@ def test_a_bundle_brings_its_own_d_and_an_absolute_path(tmp_path, monkeypatch):
     assert experiment.config.synergies.bundle == str(tmp_path / "bundle")
 
 
-def test_a_run_with_given_synergies_says_that_nothing_is_explored_fitted_or_prefilled(tmp_path):
+def test_config_with_given_synergies_has_no_exploration_or_prefill(tmp_path):
     names = [f"muscle_{i}" for i in range(16)]
     save_bundle(SynergyDecoder(3, 16), tmp_path / "a", task="overactuated", actuators=names)
     given = tiny(f"synergies='{tmp_path}/a'", "learn.prefill=true", f"run_dir='{tmp_path}/run'")
@@ -178,7 +178,7 @@ def test_a_run_with_given_synergies_says_that_nothing_is_explored_fitted_or_pref
     assert Experiment(saved, resume=tmp_path / "run").config == experiment.config
 
 
-def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
+def test_unique_run_folders_are_numbered(tmp_path):
     folders = [RunFolder(tmp_path / "run", tiny(), unique=True) for _ in range(3)]
     for folder in folders:
         folder.open(resume=False)
@@ -188,7 +188,7 @@ def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
         folder.close()
 
 
-def test_wandb_gets_name_and_configuration_and_a_resumed_run_is_the_same_run(tmp_path, monkeypatch):
+def test_wandb_gets_title_and_config_and_the_same_id_on_resume(tmp_path, monkeypatch):
     begun = []
 
     def get_logger(kind, folder, title, *, wandb_kwargs):
@@ -208,7 +208,7 @@ def test_wandb_gets_name_and_configuration_and_a_resumed_run_is_the_same_run(tmp
     assert kwargs[0]["id"] == kwargs[1]["id"] != kwargs[2]["id"]
 
 
-def test_arguments_reach_the_simulator(tmp_path):
+def test_env_kwargs_reach_the_simulator(tmp_path):
     config = tiny("env=Pendulum-v1", "+env_kwargs.g=0.0", f"run_dir='{tmp_path}/run'")
     experiment = Experiment(OmegaConf.merge(config, {"num_synergies": 1}))
     assert simulator(experiment.context.make_env()).g == 0.0
@@ -226,9 +226,7 @@ def said(monkeypatch, tmp_path, capabilities: dict[str, bool], *overrides: str) 
 
 
 @pytest.mark.parametrize("network", ["actor", "critic"])
-def test_bfloat16_on_a_processor_without_instructions_for_it_is_told(
-    network, monkeypatch, tmp_path
-):
+def test_bfloat16_warns_without_hardware_support(network, monkeypatch, tmp_path):
     without = {"avx2": True, "avx512_f": True, "avx512_bf16": False}
     asked = f"{network}.body=residual_bfloat16"
     assert said(monkeypatch, tmp_path, without, asked) == [
@@ -238,13 +236,11 @@ def test_bfloat16_on_a_processor_without_instructions_for_it_is_told(
 
 
 @pytest.mark.parametrize("name", ["avx512_bf16", "amx_bf16", "bf16", "sve_bf16"])
-def test_bfloat16_on_a_processor_with_instructions_for_it_needs_no_words(
-    name, monkeypatch, tmp_path
-):
+def test_bfloat16_does_not_warn_with_hardware_support(name, monkeypatch, tmp_path):
     assert not said(monkeypatch, tmp_path, {name: True}, "actor.body=residual_bfloat16")
 
 
-def test_float32_needs_no_words(monkeypatch, tmp_path):
+def test_float32_does_not_warn(monkeypatch, tmp_path):
     assert not said(monkeypatch, tmp_path, {}, "actor.body=residual")
 
 
@@ -278,19 +274,19 @@ def test_no_preset_chooses_bfloat16(preset):
         ("learn.sac.n_steps=3", "learn.sac.n_steps is called learn.n_steps now."),
     ],
 )
-def test_a_renamed_setting_is_answered_with_its_name_of_now(argument, words):
+def test_renamed_setting_is_refused_with_its_new_name(argument, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         translate([argument], CONF)
 
 
 @pytest.mark.parametrize("now", sorted(set(RENAMED.values())))
-def test_every_name_of_now_is_one_that_exists(now):
+def test_every_new_name_of_a_renamed_setting_exists(now):
     key = now.partition("=")[0]
     configs = tiny(), tiny("exploration=metra")
     assert any(OmegaConf.select(config, key) is not None for config in configs)
 
 
-def test_former_presets_and_paths_and_kinds_compose():
+def test_former_presets_paths_and_kinds_compose():
     former = ("learner=residual", "experiment=laptop", "faithful=default", "synergies=some/run")
     null = ("learner=null", "experiment=null", "faithful=null", "synergies=some/run")
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -307,7 +303,7 @@ def test_former_presets_and_paths_and_kinds_compose():
 # Several seeds -----------------------------------------------------------------------------------
 
 
-def test_each_seed_has_the_folder_that_it_would_have_by_itself():
+def test_each_of_several_seeds_has_the_folder_of_a_single_run():
     config = tiny("seeds=[3,5]", "env=overactuated")
     config.run_dir, config.progress = "runs/a-${seed}", True
     configs = of_each_seed(config)
@@ -320,13 +316,13 @@ def test_each_seed_has_the_folder_that_it_would_have_by_itself():
     assert not any(OmegaConf.is_interpolation(own, "run_dir") for own in configs)
 
 
-def test_seeds_that_would_share_a_folder_have_one_each_below_it():
+def test_seeds_of_one_run_dir_get_subfolders():
     configs = of_each_seed(tiny("seeds=[3,5]", "run_dir=runs/a"))
     assert [own.run_dir for own in configs] == ["runs/a/seed3", "runs/a/seed5"]
 
 
 @pytest.mark.parametrize("seeds", ["[]", "[0,0]", "[0,1.5]", "[true,2]", "3", "text"])
-def test_seeds_that_are_no_list_of_different_seeds_are_one_sentence(seeds):
+def test_invalid_seeds_are_refused(seeds):
     with pytest.raises(ValueError, match=r"seeds is .*; it must be a list of different whole"):
         of_each_seed(tiny(f"seeds={seeds}", "run_dir=runs/a"))
 
@@ -334,7 +330,7 @@ def test_seeds_that_are_no_list_of_different_seeds_are_one_sentence(seeds):
 FOLDERS = ("runs/a", "my runs/b", "läufe/c", "it's/d", "a,b/e", "1", "null", "g/\\", "h/\\'")
 
 
-def test_hydra_reads_the_names_of_folders_as_they_are():
+def test_quoted_folder_names_survive_hydra():
     for folder in FOLDERS:
         assert parse_override(f"run_dir={quoted(folder)}").value() == folder
     found = parse_override(to_go_on([Path(folder) for folder in FOLDERS])).value()

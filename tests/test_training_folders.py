@@ -52,7 +52,7 @@ def copy(finished, tmp_path) -> Path:
 # Checkpoints ---------------------------------------------------------------------------------
 
 
-def test_a_run_whose_checkpoints_are_all_damaged_is_refused_and_its_rows_stay(copy):
+def test_resume_with_damaged_checkpoints_is_refused_and_keeps_rows(copy):
     before = rows(copy)
     for checkpoint in (copy / "checkpoints" / "learn").iterdir():
         next(checkpoint.rglob("*.memmap")).unlink()
@@ -67,7 +67,7 @@ def test_a_run_whose_checkpoints_are_all_damaged_is_refused_and_its_rows_stay(co
     assert rows(copy) == before
 
 
-def test_a_finished_run_copied_without_checkpoints_is_refused_and_its_rows_stay(copy):
+def test_resume_of_a_finished_run_without_checkpoints_is_refused(copy):
     before = rows(copy)
     shutil.rmtree(copy / "checkpoints")
     with pytest.raises(OSError, match=r"at frame 608 of stage 'learn' and .*; copy check"):
@@ -76,7 +76,7 @@ def test_a_finished_run_copied_without_checkpoints_is_refused_and_its_rows_stay(
 
 
 @pytest.mark.parametrize(("method", "stage"), [("etl", "explore"), ("sac", "learn")])
-def test_so_is_one_whose_last_checkpoint_was_its_first(method, stage, tmp_path):
+def test_resume_without_the_only_checkpoint_is_refused(method, stage, tmp_path):
     run = tmp_path / "run"
     killed_when_saved(run, 608, f"method={method}", ONLY_AT_THE_END)
     before = rows(run)
@@ -86,7 +86,7 @@ def test_so_is_one_whose_last_checkpoint_was_its_first(method, stage, tmp_path):
     assert before and rows(run) == before
 
 
-def test_so_is_one_that_was_stopped_before_its_first_checkpoint_was_due(tmp_path):
+def test_resume_of_a_stopped_run_without_checkpoints_is_refused(tmp_path):
     run = tmp_path / "run"
     stopped(run, ONLY_AT_THE_END)
     before = rows(run)
@@ -96,7 +96,7 @@ def test_so_is_one_that_was_stopped_before_its_first_checkpoint_was_due(tmp_path
     assert before and rows(run) == before
 
 
-def test_stage_2_needs_no_checkpoint_of_a_stage_1_that_is_over(copy):
+def test_stage_2_resumes_without_checkpoints_of_stage_1(copy):
     shutil.rmtree(copy / "checkpoints" / "explore")
     assert resume(copy, "learn.frames=640")["learn"]["frames"] == 640
 
@@ -106,7 +106,7 @@ def test_stage_2_needs_no_checkpoint_of_a_stage_1_that_is_over(copy):
 
 @pytest.mark.parametrize("name", ["versions.json", "saved.json", "csv/scalars/learn/updates.csv"])
 @pytest.mark.parametrize("content", [b"\xff\x00\n", b"{\n", b'"text"\n'])
-def test_a_damaged_file_is_named_and_the_run_goes_on_without_it(name, content, copy):
+def test_resume_names_a_damaged_file_and_works_without_it(name, content, copy):
     file = copy / name
     file.write_bytes(content)
     # Only a run without checkpoints asks what was saved.
@@ -121,7 +121,7 @@ def test_a_damaged_file_is_named_and_the_run_goes_on_without_it(name, content, c
     assert resume(copy)["learn"]["frames"] == 608
 
 
-def test_a_row_that_was_being_written_at_a_crash_is_dropped(copy):
+def test_resume_drops_a_truncated_row(copy):
     file = copy / "csv/scalars/learn/updates.csv"
     whole = file.read_text()
     file.write_text(f"{whole}2000,1e")
@@ -129,7 +129,7 @@ def test_a_row_that_was_being_written_at_a_crash_is_dropped(copy):
     assert file.read_text() == whole
 
 
-def test_damaged_transitions_of_stage_1_are_named(copy):
+def test_resume_with_damaged_transitions_of_stage_1_is_refused(copy):
     shutil.rmtree(copy / "checkpoints" / "learn")
     (copy / "saved.json").unlink()
     (copy / "explored.safetensors").write_bytes(b"no tensors")
@@ -140,9 +140,7 @@ def test_damaged_transitions_of_stage_1_are_named(copy):
 # Synergies from elsewhere --------------------------------------------------------------------
 
 
-def test_a_run_is_evaluated_and_goes_on_where_others_synergies_are_gone_and_it_was_moved(
-    bundle, tmp_path
-):
+def test_moved_run_resumes_without_its_original_bundle(bundle, tmp_path):
     whole, run, moved = (tmp_path / name for name in ("whole", "run", "moved"))
     Experiment(tiny(f"run_dir='{whole}'", f"synergies='{bundle}'")).run()
     killed_when_saved(run, 320, f"synergies='{bundle}'")
@@ -155,7 +153,7 @@ def test_a_run_is_evaluated_and_goes_on_where_others_synergies_are_gone_and_it_w
     assert numbers(moved) == numbers(whole)
 
 
-def test_a_run_that_lost_its_synergies_too_says_where_they_belong(bundle, tmp_path):
+def test_resume_without_any_synergies_names_their_folder(bundle, tmp_path):
     run = tmp_path / "run"
     killed_when_saved(run, 320, f"synergies='{bundle}'")
     kept = tmp_path / "kept"
@@ -173,18 +171,14 @@ def test_a_run_that_lost_its_synergies_too_says_where_they_belong(bundle, tmp_pa
 
 @pytest.mark.parametrize("begun_with", ["frames", "learn.frames"])
 @pytest.mark.parametrize("longer", ["frames", "learn.frames"])
-def test_the_budget_given_on_resume_counts_whichever_setting_gave_the_first(
-    begun_with, longer, tmp_path
-):
+def test_budget_given_on_resume_replaces_either_budget_setting(begun_with, longer, tmp_path):
     run = tmp_path / "run"
     Experiment(tiny(f"run_dir='{run}'", "method=sac", f"{begun_with}=320")).run()
     assert resume(run, f"{longer}=640")["learn"]["frames"] == 640
     assert resume(run)["learn"]["frames"] == 640, "it is the budget from now on"
 
 
-def test_a_simulation_that_diverges_at_every_resume_goes_on_with_another_restart_seed(
-    tmp_path, monkeypatch
-):
+def test_restart_seed_resumes_past_a_diverging_simulation(tmp_path, monkeypatch):
     seeds, deadly = [], set()
     reset, step = AnalyticOveractuated.reset, AnalyticOveractuated.step
 
@@ -215,7 +209,7 @@ def test_a_simulation_that_diverges_at_every_resume_goes_on_with_another_restart
     assert numbers(run) != numbers(tmp_path / "whole")
 
 
-def test_a_checkout_that_nobody_installed_has_facts_too(monkeypatch):
+def test_facts_of_a_package_that_is_not_installed(monkeypatch):
     def missing(name: str) -> str:
         if name == "torchrl_etl":
             raise PackageNotFoundError(name)

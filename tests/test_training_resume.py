@@ -103,7 +103,7 @@ def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(
     assert numbers(run) == uninterrupted
 
 
-def test_killed_before_the_first_checkpoint_starts_that_stage_over(tmp_path, uninterrupted):
+def test_resume_before_the_first_checkpoint_starts_the_stage_over(tmp_path, uninterrupted):
     run = tmp_path / "run"
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
     experiment.folder.open(resume=False)
@@ -112,7 +112,7 @@ def test_killed_before_the_first_checkpoint_starts_that_stage_over(tmp_path, uni
     assert numbers(run) == uninterrupted
 
 
-def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted):
+def test_another_seed_gives_other_numbers(tmp_path, uninterrupted):
     run = tmp_path / "run"
     Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "seed=1")).run()
     other = numbers(run)
@@ -120,7 +120,7 @@ def test_same_seed_same_numbers_and_another_seed_others(tmp_path, uninterrupted)
     assert other["csv/scalars/learn/return.csv"] != uninterrupted["csv/scalars/learn/return.csv"]
 
 
-def test_a_damaged_newest_checkpoint_falls_back_and_says_so(copy, uninterrupted):
+def test_resume_falls_back_from_a_damaged_newest_checkpoint(copy, uninterrupted):
     newest = max((copy / "checkpoints" / "learn").glob("checkpoint-*"))
     victim = next(path for path in newest.rglob("*.memmap") if path.stat().st_size)
     content = bytearray(victim.read_bytes())
@@ -134,7 +134,7 @@ def test_a_damaged_newest_checkpoint_falls_back_and_says_so(copy, uninterrupted)
     assert numbers(copy) == uninterrupted
 
 
-def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numbers(tmp_path):
+def test_sac_with_learner_options_resumes_with_the_same_numbers(tmp_path):
     learner = (
         *("method=sac", "actor.body=residual", "learn.critic.bins=11", "learn.noise.kind=held"),
         *("learn.sac.return_bound=5", "learn.replay_ratio=0.5", "frames=608"),
@@ -149,13 +149,13 @@ def test_the_control_with_every_option_of_its_learner_goes_on_with_the_same_numb
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_a_polite_stop_saves_and_leaves(number, tmp_path):
+def test_stop_signal_saves_a_checkpoint(number, tmp_path):
     stopped(tmp_path / "run", *REMEMBERS, number=number)
     (checkpoint,) = (tmp_path / "run" / "checkpoints").glob("*/*")
     assert checkpoint.name == "checkpoint-000000000224" and (checkpoint / "seal.json").exists()
 
 
-def test_a_run_that_was_stopped_politely_goes_on(tmp_path):
+def test_stopped_run_resumes_without_logging_a_frame_twice(tmp_path):
     run = tmp_path / "run"
     experiment = stopped(run, *REMEMBERS)
     summary = Experiment(resumed_config(run), resume=run).run()
@@ -166,7 +166,7 @@ def test_a_run_that_was_stopped_politely_goes_on(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["process", "async"])
-def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, tmp_path):
+def test_stop_signal_to_the_process_group_saves_a_checkpoint(kind, tmp_path):
     run = tmp_path / "run"
     arguments = [*TINY, f"collector={kind}", "collector.num_workers=1", "explore.frames=1000000"]
     process = subprocess.Popen(
@@ -184,7 +184,7 @@ def test_a_stop_signal_to_the_whole_process_group_is_obeyed_after_saving(kind, t
     assert "Traceback" not in output
 
 
-def test_a_checkpoint_that_could_run_code_is_not_loaded(copy):
+def test_checkpoint_with_a_pickle_is_not_loaded(copy):
     newest = max((copy / "checkpoints" / "learn").glob("checkpoint-*"))
     assert {path.suffix for path in newest.rglob("*") if path.is_file()} == {".json", ".memmap"}
     (newest / "planted.pkl").write_bytes(b"not even read")
@@ -198,9 +198,7 @@ def test_a_checkpoint_that_could_run_code_is_not_loaded(copy):
 @pytest.mark.parametrize(
     "slow_part", ["explore.fit.final_updates=100000", "vaf_curve.updates=100000"]
 )
-def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
-    slow_part, tmp_path, monkeypatch
-):
+def test_run_stopped_in_final_fit_or_pictures_resumes(slow_part, tmp_path, monkeypatch):
     run = tmp_path / "run"
     settings = ("pictures=true", "explore.frames=320", slow_part)
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", *settings))
@@ -222,7 +220,7 @@ def test_a_polite_stop_in_the_final_fit_or_the_pictures_goes_on_too(
     assert (run / "pictures" / "vaf.png").exists()
 
 
-def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_path, monkeypatch):
+def test_run_stopped_in_prefill_updates_resumes(tmp_path, monkeypatch):
     run = tmp_path / "run"
     experiment = Experiment(tiny(f"run_dir='{run}'", "learn.prefill=true"))
     learn, updates = SACLearner.updates, []
@@ -244,7 +242,7 @@ def test_a_polite_stop_amid_the_updates_for_what_was_explored_goes_on_too(tmp_pa
     assert experiment.folder.series("learn/updates")[1][-1] == (own + 600) // 16
 
 
-def test_a_run_that_only_explored_goes_on_to_learn_from_that(tmp_path, uninterrupted):
+def test_run_of_stage_1_resumes_with_stage_2(tmp_path, uninterrupted):
     run = tmp_path / "run"
     experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "stage=explore"))
     experiment.run()

@@ -40,7 +40,7 @@ def changed(file: Path, **values) -> None:
         b"env: overactuated\nseed: 0\nexplore: {}\nlearn: null\ncheckpoint: {}\n",
     ],
 )
-def test_a_damaged_configuration_is_one_sentence(content, file):
+def test_damaged_config_gives_a_one_line_error(content, file):
     file.write_bytes(content)
     with pytest.raises(ValueError, match="is damaged") as caught:
         resumed_config(file.parent)
@@ -49,21 +49,21 @@ def test_a_damaged_configuration_is_one_sentence(content, file):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_one_that_was_cut_short_is_damaged(share, file):
+def test_truncated_config_is_refused(share, file):
     text = file.read_text()
     file.write_text(text[: int(share * len(text))])
     with pytest.raises(ValueError, match="is damaged"):
         resumed_config(file.parent)
 
 
-def test_one_of_a_release_with_other_names_says_so(file):
+def test_config_with_former_setting_names_is_refused(file):
     changed(file, learn__anchor=0.1)
     words = "other names (learn.anchor, now learn.decoder.distillation_weight)"
     with pytest.raises(ValueError, match=re.escape(words)):
         resumed_config(file.parent, defaults=tiny())
 
 
-def test_a_method_by_its_former_key_goes_on(file):
+def test_config_with_the_former_method_key_resumes(file):
     changed(file, method__learner="sac")
     config = OmegaConf.load(file)
     del config.method["kind"]
@@ -84,7 +84,7 @@ def test_settings_newer_than_the_run_take_their_defaults_with_a_warning(file):
     validate(resumed)
 
 
-def test_a_newer_setting_can_be_answered_when_resuming(file, recwarn):
+def test_newer_setting_given_on_resume_does_not_warn(file, recwarn):
     config = OmegaConf.load(file)
     del config.learn["prefill"]
     file.write_text(OmegaConf.to_yaml(config))
@@ -118,7 +118,7 @@ def test_a_newer_setting_can_be_answered_when_resuming(file, recwarn):
         (["frames=2000", "learn.frames=900"], "each sets the budget; give one."),
     ],
 )
-def test_what_cannot_be_asked_for_is_one_sentence(overrides, words, file):
+def test_invalid_override_on_resume_gives_a_one_line_error(overrides, words, file):
     before = file.read_text()
     with pytest.raises(ValueError, match=re.escape(words)) as caught:
         resumed_config(file.parent, overrides)
@@ -126,7 +126,7 @@ def test_what_cannot_be_asked_for_is_one_sentence(overrides, words, file):
     assert file.read_text() == before
 
 
-def test_what_may_change_is_taken_also_below_a_section_of_another_library(file):
+def test_allowed_overrides_on_resume_are_applied(file):
     asked = ["log_every=7", "++checkpoint.every=9", "+logger_kwargs.wandb.project=mine"]
     resumed = resumed_config(file.parent, [*asked, f"resume={file.parent}"])
     assert (resumed.log_every, resumed.checkpoint.every) == (7, 9)
@@ -134,6 +134,6 @@ def test_what_may_change_is_taken_also_below_a_section_of_another_library(file):
     assert resumed.frames == 1000
 
 
-def test_a_budget_of_learning_replaces_that_of_all_frames(file):
+def test_learn_frames_on_resume_replaces_frames(file):
     resumed = resumed_config(file.parent, ["learn.frames=900"])
     assert resumed.frames is None and resumed.learn.frames == 900

@@ -10,7 +10,7 @@ from tests.commands import script
 from tests.configs import ROOT
 
 
-def test_a_stretch_is_the_mean_of_its_log_and_an_unfinished_one_is_left_out(tmp_path: Path):
+def test_returns_are_averaged_over_complete_stretches(tmp_path: Path):
     run = tmp_path / "run"
     log = run / "csv" / "scalars" / "learn" / "return.csv"
     log.parent.mkdir(parents=True)

@@ -16,7 +16,7 @@ from tests.stages import changed, explorer, fill, learn_stage, method_stage, sna
 from torchrl_etl.training import alone
 
 
-def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
+def test_sac_scales_rewards_by_running_returns():
     stage = method_stage("sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
     fill(stage)
     seen = {}
@@ -42,7 +42,7 @@ def test_the_control_learns_on_rewards_in_units_of_the_returns_so_far():
         lambda: explorer("explore.sac.tau=0.3", "exploration.tau=0.3").stage,
     ],
 )
-def test_an_update_moves_the_temperature_and_every_target(make):
+def test_update_moves_the_temperature_and_every_target_network(make):
     stage = make()
     fill(stage)
     stage.close()
@@ -64,7 +64,7 @@ def test_an_update_moves_the_temperature_and_every_target(make):
 
 
 @pytest.mark.parametrize("layout", [(16,), (2, 8), (2, 2, 4)])
-def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
+def test_running_returns_are_summed_along_time_in_any_batch_layout(layout):
     """[time] of one simulator, [simulators, time], [workers, simulators, time]."""
     stage = method_stage("sac", "learn.sac.return_bound=2", "learn.reward_scale=1")
     batch = stage.batches.next().reshape(-1)[:16].reshape(layout)
@@ -85,7 +85,7 @@ def test_returns_are_summed_along_time_however_batches_are_laid_out(layout):
 @pytest.mark.parametrize(
     "method", ["sac", "etl", "lattice", "lattice_plain", "dynsyn", "eme", "sar"]
 )
-def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp_path):
+def test_actor_and_critics_read_normalized_observations(method, tmp_path):
     settings = ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
     stage = method_stage(method, *settings)
     fill(stage)
@@ -116,7 +116,7 @@ def test_actor_and_critics_see_observations_in_units_of_those_so_far(method, tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("engine", "oldest"), [("single", 1), ("process", 1), ("distributed", 2)])
-def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
+def test_observation_statistics_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
     # A worker on another machine is asked for a batch before the last one is learned from.
     settings = (f"collector={engine}", "collector.ahead=false")
     settings += () if engine == "single" else ("collector.num_workers=1",)
@@ -135,7 +135,7 @@ def test_statistics_of_observations_reach_the_workers_with_the_weights(engine, o
 
 
 @pytest.mark.parametrize("number", [1, 3])
-def test_there_are_as_many_critics_as_were_asked_for(number):
+def test_num_critics_sets_the_number_of_critics(number):
     stage = learn_stage(None, f"learn.sac.num_critics={number}")
     fill(stage)
     weights = stage.learner.objective.sac.qvalue_network_params.flatten_keys().values()
@@ -144,7 +144,7 @@ def test_there_are_as_many_critics_as_were_asked_for(number):
     stage.close()
 
 
-def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(tmp_path):
+def test_unit_rows_normalizes_linear_layers_only(tmp_path):
     settings = ("learn.sac.unit_rows=true", *RESIDUAL, f"run_dir={tmp_path}")
     stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     fill(stage)
@@ -160,7 +160,7 @@ def test_rows_of_actor_and_critics_keep_unit_length_and_nothing_else_is_touched(
     stage.close()
 
 
-def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns():
+def test_ema_averages_the_actor_and_collection_uses_the_actor():
     stage = learn_stage(None, "learn.sac.ema_decay=0.25")
     fill(stage)
     averaged = list(stage.learner.ema.module.parameters())
@@ -180,7 +180,7 @@ def test_what_is_evaluated_is_an_average_of_the_actor_that_collects_and_learns()
     stage.close()
 
 
-def test_an_average_that_keeps_nothing_is_the_actor():
+def test_ema_with_decay_zero_equals_the_actor():
     stage = learn_stage(None, "learn.sac.ema_decay=0")
     fill(stage)
     stage.update()
@@ -209,7 +209,7 @@ def spans(rows):
     )
 
 
-def test_a_transition_spans_n_steps_but_no_end_of_an_episode():
+def test_n_step_transition_stops_at_the_end_of_an_episode():
     stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
     batch = six_steps(ends_after=3)
     spanned = stage.multi_step(batch)
@@ -224,7 +224,7 @@ def test_a_transition_spans_n_steps_but_no_end_of_an_episode():
     stage.close()
 
 
-def test_a_transition_spans_steps_of_the_next_batch_if_that_goes_on():
+def test_n_step_transition_spans_consecutive_batches():
     for size in (1, 2, 6):  # of the batches that the same 18 steps come in
         stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
         steps = torch.cat([six_steps(ends_after=3, begins=k) for k in (0, 6, 12)], 1)
@@ -240,7 +240,7 @@ def test_a_transition_spans_steps_of_the_next_batch_if_that_goes_on():
         stage.close()
 
 
-def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many():
+def test_buffer_stores_step_counts_only_for_n_step_returns():
     stage = learn_stage(None)
     fill(stage)
     assert "steps_to_next_obs" not in stage.buffer.storage[:].keys()
@@ -257,7 +257,7 @@ def test_with_one_step_nothing_is_summed_and_with_more_the_buffer_knows_how_many
     stage.close()
 
 
-def test_learning_rates_fall_in_a_line_with_the_frames():
+def test_learning_rates_decay_linearly_with_frames():
     stage = learn_stage(None, "learn.sac.lr_end=0.5", "learn.frames=640")
     initial = [group["lr"] for group in stage.learner.optimizer.param_groups]
     while not stage.finished:

@@ -22,7 +22,7 @@ from torchrl_etl.synergies import fit_gmvae
 from torchrl_etl.training import alone
 
 
-def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_updates(tmp_path):
+def test_prefill_copies_transitions_of_stage_1_and_adds_their_updates(tmp_path):
     settings = ("learn.prefill=true", "learn.decoder.residual=0.5", "learn.reward_scale=3")
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'", *settings))
     experiment.run()
@@ -45,7 +45,7 @@ def test_stage_2_takes_the_transitions_of_stage_1_and_catches_up_on_their_update
     assert first["synergy"][:, : decoder.num_synergies].abs().max() <= 1
 
 
-def test_after_a_start_that_failed_the_next_is_another_one(monkeypatch):
+def test_collection_restarts_after_a_failed_start(monkeypatch):
     stage = learn_stage()
     stage.close()
 
@@ -65,13 +65,13 @@ def test_after_a_start_that_failed_the_next_is_another_one(monkeypatch):
 
 
 @pytest.mark.parametrize("ratio", [-1.0, math.nan, 1e9])
-def test_a_stage_refuses_a_replay_ratio_that_cannot_be(ratio, tmp_path):
+def test_invalid_replay_ratio_is_refused(ratio, tmp_path):
     context = Experiment(tiny("method=sac", f"run_dir='{tmp_path}/run'")).context
     with pytest.raises(ValueError, match=r"learn\.replay_ratio is .*; it must be a number in"):
         context.stage(context.learner(), replay_ratio=ratio)
 
 
-def test_a_learning_rate_of_null_is_the_learner_s():
+def test_learning_rate_of_null_is_that_of_the_learner():
     for stage in (
         explorer("exploration.lr=null", "synergies.lr=0.25", "explore.sac.lr=0.5").stage,
         learn_stage(None, "learn.decoder.lr=null", "learn.sac.lr=0.5"),
@@ -81,7 +81,7 @@ def test_a_learning_rate_of_null_is_the_learner_s():
         stage.close()
 
 
-def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
+def test_prefill_owes_updates_for_every_frame_of_stage_1():
     found = explorer("action_repeat=2")
     found.stage.collect()
     second = learn_stage(SynergyDecoder.from_gmvae(found.model.model), "action_repeat=2")
@@ -90,7 +90,7 @@ def test_transitions_of_stage_1_earn_the_updates_of_all_their_frames():
     found.stage.close(), second.close()
 
 
-def test_coefficients_of_decoded_actions_are_found_again():
+def test_encoded_actions_decode_to_nearly_the_same_actions():
     coefficients = 2 * torch.rand(512, 2) - 1
     actions = torch.tanh(coefficients @ torch.randn(2, 16))
     gmvae = fit_gmvae(GMVAE(16, 2, num_components=1), actions, updates=1500)
@@ -116,7 +116,7 @@ def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
     stage.close()
 
 
-def test_the_bonus_of_a_sample_follows_the_encoder_as_it_is_now():
+def test_sampled_bonus_uses_the_current_encoder():
     found = explorer("exploration.bonus.normalize=false", "exploration.bonus.extrinsic_weight=0")
     stage = found.stage
     fill(stage)
@@ -154,7 +154,7 @@ def test_directions_are_unit_vectors_kept_through_the_episode():
 
 
 @pytest.mark.parametrize("actions", ["policy", "mean", "sampled"])
-def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
+def test_gmvae_is_fitted_to_the_configured_actions(actions):
     found = explorer(f"explore.fit.actions={actions}", "exploration.relabel=0")
     stage = found.stage
     batch = stage.collect()
@@ -167,7 +167,7 @@ def test_the_gmvae_is_shown_the_actions_that_were_asked_for(actions):
     stage.close()
 
 
-def test_synergies_see_what_the_policy_does_on_normalized_observations():
+def test_synergies_are_fitted_to_actions_on_normalized_observations():
     found = explorer("explore.sac.normalize_observations=true", "exploration.relabel=0")
     fill(found.stage)
     rows = found.stage.buffer.storage[:]
@@ -178,7 +178,7 @@ def test_synergies_see_what_the_policy_does_on_normalized_observations():
     found.stage.close()
 
 
-def test_updates_after_the_last_frame_are_adams_steps_of_the_synergy_model_alone():
+def test_final_updates_are_adam_steps_of_the_synergy_model_alone():
     found, twin = explorer(), explorer()  # of the same seed
     fill(found.stage)
     learner = found.stage.learner
@@ -199,7 +199,7 @@ def test_updates_after_the_last_frame_are_adams_steps_of_the_synergy_model_alone
     found.stage.close(), twin.stage.close()
 
 
-def test_an_update_learns_for_directions_that_nobody_followed():
+def test_relabel_draws_directions_that_were_not_followed():
     found = explorer()
     stage = found.stage
     fill(stage)
@@ -215,7 +215,7 @@ def test_an_update_learns_for_directions_that_nobody_followed():
     stage.close()
 
 
-def test_the_better_share_is_the_better_rewarded_one():
+def test_best_share_keeps_the_highest_rewards():
     found = explorer("explore.fit.best_share=0.25", "explore.fit.actions=mean")
     stage = found.stage
     fill(stage)
@@ -229,7 +229,7 @@ def test_the_better_share_is_the_better_rewarded_one():
     stage.close()
 
 
-def test_pairs_in_the_buffer_are_the_executed_ones_while_the_decoder_changes():
+def test_buffer_keeps_executed_pairs_while_the_decoder_changes():
     stage = learn_stage()
     expected = []
     for _ in range(3):
@@ -249,7 +249,7 @@ def test_pairs_in_the_buffer_are_the_executed_ones_while_the_decoder_changes():
 @pytest.mark.parametrize(
     ("fine_tuning", "learns"), [("critic", True), ("reconstruction", True), ("frozen", False)]
 )
-def test_decoder_learns_only_in_the_modes_that_say_so(fine_tuning, learns):
+def test_decoder_is_trained_unless_frozen(fine_tuning, learns):
     stage = learn_stage(None, f"learn.decoder.fine_tuning={fine_tuning}", "learn.decoder.lr=1e-2")
     fill(stage)
     if fine_tuning == "reconstruction":  # on fresh pairs Eq. 10 has no gradient at all
@@ -262,7 +262,7 @@ def test_decoder_learns_only_in_the_modes_that_say_so(fine_tuning, learns):
     stage.close()
 
 
-def test_the_entropy_leaves_a_residual_of_fixed_noise_out():
+def test_entropy_excludes_a_residual_with_fixed_noise():
     log = math.log(2 * math.pi * math.e) / 2  # of a standard Gaussian
     quiet = "learn.decoder.residual_std=0.05"
     for std, wanted in (("0.4", 2 * (log + math.log(0.4))), ("null", -2.0)):
@@ -304,7 +304,7 @@ def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
     first.close(), second.close()
 
 
-def test_updates_keep_the_ratio_that_was_asked_for():
+def test_updates_follow_the_replay_ratio():
     found = explorer("explore.replay_ratio=0.1", "explore.learning_starts=0")
     stage = found.stage
     for _ in range(5):
@@ -315,7 +315,7 @@ def test_updates_keep_the_ratio_that_was_asked_for():
     stage.close()
 
 
-def test_frames_are_steps_of_the_simulator_however_long_an_action_lasts(tmp_path):
+def test_frames_count_simulator_steps_under_action_repeat(tmp_path):
     run = Experiment(
         tiny(
             f"run_dir={tmp_path}/run",
@@ -346,7 +346,7 @@ def test_gaussian_divergence_trains_its_latent_dynamics():
     stage.close()
 
 
-def test_restarting_collection_lets_the_old_simulators_go():
+def test_restarting_collection_frees_the_old_simulators():
     found = explorer()
     stage = found.stage
 
@@ -363,7 +363,7 @@ def test_restarting_collection_lets_the_old_simulators_go():
     assert simulators() == before - 4
 
 
-def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
+def test_newest_rows_are_returned_after_the_buffer_wraps():
     found = explorer("explore.buffer_size=100")
     stage = found.stage
     for _ in range(5):
@@ -373,7 +373,7 @@ def test_the_newest_rows_are_the_newest_also_after_the_buffer_wrapped():
 
 
 @pytest.mark.slow
-def test_a_compiled_update_is_the_same_update():
+def test_compiled_update_equals_the_eager_update():
     settings = (*RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])

@@ -51,7 +51,7 @@ def small_run(tmp_path: Path, text: str) -> Run:
 
 
 @pytest.mark.slow
-def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
+def test_killed_sweep_resumes_and_finishes_every_run(tmp_path):
     out = tmp_path / "a sweep"
     what = ["tasks=[overactuated]", "methods=[sac,etl]", "seeds=[0]", "frames=900", "jobs=2"]
     arguments = [*what, f"settings={' '.join(SMALL)}", f"out={out}"]
@@ -70,7 +70,7 @@ def test_a_queue_that_was_killed_goes_on_and_ends_with_every_run(tmp_path):
 
 
 @pytest.mark.slow
-def test_seeds_in_one_process_that_were_killed_go_on_together(tmp_path):
+def test_killed_sweep_of_seeds_in_one_process_resumes(tmp_path):
     out = tmp_path / "a sweep, (new)=1"
     what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0,1]", "frames=900", "jobs=1"]
     what += ["seeds_at_once=true", f"settings={' '.join(SMALL)}", f"out={out}"]
@@ -83,7 +83,7 @@ def test_seeds_in_one_process_that_were_killed_go_on_together(tmp_path):
     assert [(out / run / "log.txt").exists() for run in runs] == [True, False]
 
 
-def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
+def test_failing_run_is_retried_and_then_given_up(tmp_path):
     run = small_run(tmp_path, "print('it broke'); raise SystemExit(3)")
     sweep = Sweep([run], tmp_path / "out", jobs=1, attempts=2)
     for _ in sweep:
@@ -93,7 +93,7 @@ def test_a_run_that_fails_is_tried_again_and_then_given_up(tmp_path):
 
 
 @pytest.mark.parametrize("summary", ["{}", '{"learn": {"frames_charged": 9}}'])
-def test_a_finished_run_is_left_alone(tmp_path, summary):
+def test_finished_run_is_not_started(tmp_path, summary):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     run.path.mkdir(parents=True)
     (run.path / "summary.json").write_text(summary)
@@ -103,7 +103,7 @@ def test_a_finished_run_is_left_alone(tmp_path, summary):
     assert sweep.status(run) == "finished" and run.starts == 0
 
 
-def test_a_run_that_ended_with_fewer_frames_goes_on(tmp_path):
+def test_run_with_fewer_frames_is_resumed(tmp_path):
     run = small_run(tmp_path, "import sys; print(sys.argv[1:])")
     run.path.mkdir(parents=True)
     (run.path / "config.yaml").write_text("frames: 8")
@@ -114,7 +114,7 @@ def test_a_run_that_ended_with_fewer_frames_goes_on(tmp_path):
     assert (run.path / "log.txt").read_text() == f"['resume={run.path}', 'frames=9']\n"
 
 
-def test_a_run_with_other_settings_is_not_taken_for_this_one(tmp_path):
+def test_run_begun_with_other_settings_is_refused(tmp_path):
     run = small_run(tmp_path, "")
     for _ in Sweep([run], tmp_path / "out", jobs=1, attempts=1):
         pass
@@ -126,7 +126,7 @@ def test_a_run_with_other_settings_is_not_taken_for_this_one(tmp_path):
         Sweep([other], tmp_path / "out", jobs=1)
 
 
-def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
+def test_run_finished_in_results_csv_is_not_started(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     (tmp_path / "out").mkdir()
     row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "method": "method", "frames": "9"}
@@ -142,7 +142,7 @@ def test_a_run_of_which_only_rows_are_left_is_not_run_again(tmp_path):
     assert (tmp_path / "out" / "results.csv").read_text() == text
 
 
-def test_runs_end_with_the_queue(tmp_path):
+def test_closing_the_sweep_ends_its_runs(tmp_path):
     run = small_run(tmp_path, "import time; time.sleep(600)")
     sweep = Sweep([run], tmp_path / "out", jobs=1)
     next(iterator := iter(sweep))
@@ -151,7 +151,7 @@ def test_runs_end_with_the_queue(tmp_path):
     assert run.process.poll() is not None
 
 
-def test_two_queues_do_not_work_in_one_folder(tmp_path):
+def test_second_sweep_in_the_same_folder_is_refused(tmp_path):
     sweep = Sweep([], tmp_path / "out", jobs=1)
     other = f"from torchrl_etl.training import Sweep; Sweep([], {str(tmp_path / 'out')!r}, jobs=1)"
     environ = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -184,7 +184,7 @@ def test_two_queues_do_not_work_in_one_folder(tmp_path):
         ("jobs=two", "jobs is 'two'"),
     ],
 )
-def test_a_mistake_is_told_before_anything_runs(override, words, recipe):
+def test_invalid_sweep_setting_is_refused(override, words, recipe):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("sweep", [override])
     with pytest.raises((ValueError, HydraException), match=words):
@@ -202,11 +202,11 @@ def test_a_mistake_is_told_before_anything_runs(override, words, recipe):
         ("my_module:MyTask-v0:fixed", ("my_module:MyTask-v0", "fixed")),
     ],
 )
-def test_only_a_goal_s_own_words_are_read_as_the_goal(task, expected, recipe):
+def test_split_goal_recognizes_only_fixed_and_random(task, expected, recipe):
     assert recipe.split_goal(task) == expected
 
 
-def test_a_queue_takes_a_task_of_one_s_own_and_its_random_goal(recipe, tmp_path, monkeypatch):
+def test_sweep_takes_a_custom_task_with_a_random_goal(recipe, tmp_path, monkeypatch):
     (tmp_path / "queue_tasks.py").write_text(
         "import gymnasium as gym\n"
         "entry = 'torchrl_etl.envs.analytic:AnalyticOveractuated'\n"

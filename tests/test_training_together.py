@@ -33,7 +33,7 @@ def one_after_another(group: SideBySide, inputs) -> list:
     return [each.updates(own) for each, own in zip(group.learners, inputs, strict=True)]
 
 
-def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
+def test_seeds_together_give_the_numbers_of_single_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(SideBySide, "updates", one_after_another)
     summaries = together([work(tmp_path / f"{seed}", seed) for seed in (0, 1)])
     for seed, summary in enumerate(summaries):
@@ -42,7 +42,7 @@ def test_every_seed_has_the_numbers_of_a_run_by_itself(tmp_path, monkeypatch):
         assert numbers(tmp_path / f"{seed}") == numbers(tmp_path / f"alone{seed}")
 
 
-def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
+def test_vmapped_updates_give_nearly_the_losses_of_a_single_run(tmp_path):
     ends = together([work(tmp_path / f"{seed}", seed, "method=sac") for seed in (0, 1)])
     assert ends[0]["learn"]["return"] != ends[1]["learn"]["return"]
     for run in (tmp_path / "0", tmp_path / "1"):
@@ -54,7 +54,7 @@ def test_seeds_that_are_updated_as_one_learn_too(tmp_path):
     assert frames == same and losses == pytest.approx(expected, rel=1e-3)
 
 
-def test_all_seeds_ask_for_a_batch_before_one_waits_for_it():
+def test_all_seeds_request_a_batch_before_any_waits():
     told = []
 
     def waits(name, batches):
@@ -69,7 +69,7 @@ def test_all_seeds_ask_for_a_batch_before_one_waits_for_it():
     assert alone(waits("c", 1)) == "c" and told[-2:] == ["c asks", "c has"]
 
 
-def test_the_workers_of_all_seeds_start_before_one_waits_for_them(tmp_path, monkeypatch):
+def test_workers_of_all_seeds_start_before_any_waits(tmp_path, monkeypatch):
     told = []
     for name in ("start_collection", "restart_collection"):
         method = getattr(Stage, name)
@@ -79,7 +79,7 @@ def test_the_workers_of_all_seeds_start_before_one_waits_for_them(tmp_path, monk
     assert told[:3] == ["start_collection"] * 2 + ["restart_collection"]
 
 
-def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
+def test_failed_seed_does_not_stop_the_others(tmp_path, monkeypatch):
     collect = Stage.collect
 
     def diverge(stage):
@@ -94,7 +94,7 @@ def test_a_seed_that_fails_leaves_the_others_to_go_on(tmp_path, monkeypatch):
     assert not (tmp_path / "1" / "summary.json").exists()
 
 
-def test_an_update_that_fails_ends_its_seeds_and_no_others(tmp_path, monkeypatch):
+def test_failed_update_ends_only_the_seeds_it_updates(tmp_path, monkeypatch):
     def full(group, inputs):
         raise RuntimeError("the GPU is full")
 
@@ -106,7 +106,7 @@ def test_an_update_that_fails_ends_its_seeds_and_no_others(tmp_path, monkeypatch
     assert ends[2]["learn"]["frames"] == 416
 
 
-def test_all_seeds_stop_saved_at_a_signal_and_go_on_together(tmp_path, monkeypatch):
+def test_all_seeds_stop_at_a_signal_and_resume_together(tmp_path, monkeypatch):
     collect = Stage.collect
 
     def collect_and_signal(stage):
