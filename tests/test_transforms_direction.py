@@ -127,7 +127,7 @@ def test_orthonormal_draws_are_rows_of_the_identity_equally_often(count):
 
 
 @pytest.mark.parametrize("kind", ["sphere", "orthonormal"])
-def test_spec_is_bounded_and_holds_the_draws(kind):
+def test_spec_is_bounded_and_contains_the_draws(kind):
     env = TransformedEnv(PointEnv((2,)), DirectionPrimer(K, kind=kind))
     spec = env.observation_spec["direction"]
     assert spec.shape == (2, K) and spec.space.low.eq(-1).all() and spec.space.high.eq(1).all()
@@ -162,7 +162,7 @@ def test_two_primers_of_one_key_are_refused():
         TransformedEnv(PointEnv(), Compose(DirectionPrimer(2), late)).reset()
 
 
-def test_agents_of_a_group_draw_directions_of_their_own():
+def test_every_agent_draws_its_own_direction():
     env = TransformedEnv(TeamEnv((3,)), DirectionPrimer(2, out_key=("agent", "direction")))
     direction = env.reset()["agent", "direction"]
     assert direction.shape == (3, TeamEnv.AGENTS, 2)

@@ -45,7 +45,7 @@ def pairs(batch, decoder=None):
     ids=str,
 )
 @pytest.mark.parametrize("layout", ["single", "batched", "around serial", "no device", "appended"])
-def test_collected_pairs_are_together_at_the_root(layout, kwargs):
+def test_collected_root_pairs_synergy_and_action_of_one_step(layout, kwargs):
     env = {
         "single": PointEnv,
         "batched": partial(PointEnv, (3,)),
@@ -64,12 +64,12 @@ def keep_at_root():
     return RenameTransform([("next", "executed_action")], ["action"], create_copy=True)
 
 
-def test_multi_step_leaves_pairs_together():
+def test_multi_step_keeps_pairs():
     make = partial(TransformedEnv, PointEnv(), SynergyAction(fixed_decoder()))
     pairs(collect(make(), postproc=MultiStep(0.9, 3)))
 
 
-def test_multi_step_leaves_pairs_of_workers_together_behind_a_rename():
+def test_multi_step_after_a_rename_keeps_pairs_of_workers():
     def transformed():
         return TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
 
@@ -80,7 +80,7 @@ def test_multi_step_leaves_pairs_of_workers_together_behind_a_rename():
 
 
 @pytest.mark.parametrize("collected", [True, False])
-def test_multi_step_transform_of_a_buffer_leaves_pairs_together(collected):
+def test_multi_step_transform_of_a_buffer_keeps_pairs(collected):
     env = TransformedEnv(PointEnv(), SynergyAction(fixed_decoder()))
     batch = (
         collect(env) if collected else keep_at_root()(env.rollout(12, break_when_any_done=False))
@@ -104,7 +104,7 @@ class _Clip(Transform):
         return action.clamp(-0.5, 0.5)
 
 
-def test_executed_action_behind_a_scaling_is_what_ran_and_root_action_what_was_decoded():
+def test_executed_action_is_scaled_and_root_action_is_as_decoded():
     env = TransformedEnv(
         PointEnv(low=0.0, high=1.0), Compose(ActionScaling(), SynergyAction(fixed_decoder()))
     )
@@ -129,13 +129,13 @@ def test_executed_action_behind_a_clip_is_clipped():
     assert torch.equal(rollout["next", "executed_action"], rollout["action"].clamp(-0.5, 0.5))
 
 
-def test_scaling_in_an_inner_environment_is_warned_of():
+def test_scaling_in_an_inner_env_warns():
     inner = TransformedEnv(PointEnv(low=0.0, high=1.0), ActionScaling())
     with pytest.warns(UserWarning, match="append SynergyAction to that environment"):
         TransformedEnv(inner, SynergyAction(fixed_decoder()), auto_unwrap=False)
 
 
-def test_works_on_a_real_env():
+def test_executed_actions_replay_a_pendulum_rollout():
     env = TransformedEnv(GymEnv("Pendulum-v1"), SynergyAction(fixed_decoder(1, low=-2.0, high=2.0)))
     env.set_seed(0)
     rollout = env.rollout(3)

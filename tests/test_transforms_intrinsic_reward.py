@@ -71,7 +71,7 @@ class TestIntrinsicReward(TransformChecks):
         torch.testing.assert_close(moved[key].view(3, HORIZON), summed)
 
     @pytest.mark.parametrize("shared", [False, True])
-    def test_group_of_agents_has_a_bonus_each_also_along_one_direction(self, shared):
+    def test_every_agent_has_a_bonus_along_its_own_or_a_shared_direction(self, shared):
         direction = "direction" if shared else ("agent", "direction")
         bonus = IntrinsicReward(
             fixed_encoder(),
@@ -182,7 +182,7 @@ def test_bonus_telescopes_over_an_episode():
     torch.testing.assert_close(total, (last - first) @ rollout["direction"][0])
 
 
-def test_encoder_is_held_by_reference_and_left_alone():
+def test_encoder_is_held_by_reference_and_unchanged():
     encoder = fixed_encoder().train()
     transform = IntrinsicReward(encoder)
     env = TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), transform))
@@ -245,7 +245,7 @@ def test_in_keys_must_be_a_pair(in_keys):
         IntrinsicReward(doubler(), in_keys=in_keys)
 
 
-def test_embedding_and_direction_of_different_size_are_refused_with_both_sizes():
+def test_embedding_and_direction_of_different_size_are_refused():
     env = TransformedEnv(PointEnv(), Compose(DirectionPrimer(3), IntrinsicReward(fixed_encoder(2))))
     with pytest.raises(ValueError, match="has 2 dimensions but 'direction' has 3"):
         env.rollout(1)
@@ -267,7 +267,7 @@ def test_missing_entries_are_named():
         IntrinsicReward(doubler())(data.exclude("next"))
 
 
-def test_bonus_before_a_running_normalization_is_that_of_the_raw_observations():
+def test_bonus_before_vecnorm_uses_the_raw_observations():
     keep = RenameTransform(["observation"], ["raw"], create_copy=True)
     bonus = IntrinsicReward(fixed_encoder(), normalize=False)
     chain = Compose(DirectionPrimer(K), keep, bonus, VecNormV2(in_keys=["observation"]))
@@ -278,7 +278,7 @@ def test_bonus_before_a_running_normalization_is_that_of_the_raw_observations():
     torch.testing.assert_close(rollout["next", "intrinsic_reward"], expected)
 
 
-def test_native_autoreset_renews_the_copy_of_the_reset_env_only():
+def test_native_autoreset_updates_the_copy_of_the_reset_env_only():
     chain = Compose(DirectionPrimer(K), IntrinsicReward(fixed_encoder()))
     env = TransformedEnv(PointEnv((3,)), chain)
     state = env.rollout(2)[:, -1]["next"].exclude("reward")
@@ -306,13 +306,13 @@ def test_two_rewards_under_one_key_are_refused_in_either_order(first):
     ).reset()
 
 
-def test_a_later_scaling_of_the_bonus_is_no_second_writer():
+def test_reward_scaling_of_the_bonus_is_allowed():
     scaled = RewardScaling(loc=0.0, scale=2.0, in_keys=["intrinsic_reward"])
     bonus = IntrinsicReward(fixed_encoder(), normalize=False)
     TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), bonus, scaled)).rollout(2)
 
 
-def test_double_precision_on_bare_data_and_an_integer_observation_are_cast():
+def test_double_and_integer_observations_are_cast():
     for dtype in (torch.float64, torch.int32):
         data = transitions([1.0, 0.0], [4.0, 1.0], [1.0, -1.0])
         data["observation"] = data["observation"].to(dtype)

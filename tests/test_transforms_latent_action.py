@@ -52,7 +52,7 @@ def shifting(size, shape=()):
 
 
 @pytest.mark.parametrize("batch_size", [(), (3,)])
-def test_a_latent_of_numbered_choices_moves_the_env_by_its_rows(batch_size):
+def test_categorical_latent_selects_a_row_of_the_embedding(batch_size):
     module, spec = shifting(4)
     env = TransformedEnv(PointEnv(batch_size), LatentAction(module, spec))
     check_env_specs(env)
@@ -83,7 +83,7 @@ def of_pushes(env):
         (lambda: SerialEnv(2, lambda: of_pushes(cart_pole())), (2,)),
     ],
 )
-def test_an_action_that_is_one_number_is_decoded_for_each_row(make, batch_size):
+def test_scalar_action_is_decoded_for_every_row(make, batch_size):
     env = make()
     check_env_specs(env)
     rollout = env.rollout(3)
@@ -91,20 +91,20 @@ def test_an_action_that_is_one_number_is_decoded_for_each_row(make, batch_size):
     assert torch.equal(rollout["next", "executed_action"], push(rollout["latent"]))
 
 
-def test_a_number_is_refused_where_the_env_takes_several():
+def test_scalar_action_for_a_vector_action_spec_is_refused():
     module = TensorDictModule(push, ["z"], ["action"])
     with pytest.raises(ValueError, match=r"makes actions of shape \[\] .* 'action' has \[5\]"):
         TransformedEnv(PointEnv(), LatentAction(module, SPEC))
 
 
 @pytest.mark.parametrize("place", [lambda t: t, lambda t: Compose(StepCounter(), t)])
-def test_a_module_of_another_width_is_refused_at_attachment(place):
+def test_module_of_another_width_is_refused_at_attachment(place):
     module = TensorDictModule(nn.Linear(D, 7), ["z"], ["action"])
     with pytest.raises(ValueError, match=r"makes actions of shape \[7\] .* 'action' has \[5\]"):
         TransformedEnv(PointEnv(), place(LatentAction(module, SPEC)))
 
 
-def test_a_module_without_keys_or_with_two_inputs_is_refused():
+def test_module_without_keys_or_with_two_inputs_is_refused():
     with pytest.raises(TypeError, match="Linear without in_keys and out_keys; wrap it"):
         LatentAction(nn.Linear(2, 5), SPEC)
     with pytest.raises(ValueError, match=r"reads \['a', 'b'\]"):

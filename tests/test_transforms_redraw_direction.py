@@ -39,7 +39,7 @@ def test_both_ends_get_the_same_new_unit_vector(size):
     assert not torch.equal(batch["direction"], transitions(*size)["direction"])
 
 
-def test_the_share_is_a_probability_and_zero_is_the_print():
+def test_share_is_the_fraction_of_redrawn_transitions():
     batch = transitions(2000)
     kept = RedrawDirection(DirectionPrimer(K), share=0.0)(batch.clone())
     assert (kept == batch).all()
@@ -48,7 +48,7 @@ def test_the_share_is_a_probability_and_zero_is_the_print():
     assert redrawn.item() == pytest.approx(0.25, abs=0.04)
 
 
-def test_new_directions_are_the_primer_s():
+def test_new_directions_are_drawn_by_the_primer():
     primer = DirectionPrimer(K, kind="orthonormal", num_directions=2)
     drawn = RedrawDirection(primer)(transitions(200))["direction"]
     assert {tuple(row) for row in drawn.tolist()} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
@@ -62,7 +62,7 @@ def test_keys_may_be_nested():
     assert torch.equal(batch[key], batch["next", "agent", "direction"])
 
 
-def test_a_buffer_keeps_what_was_followed_and_the_bonus_is_of_what_was_drawn():
+def test_buffer_keeps_followed_directions_and_bonus_uses_new_ones():
     encoder = TensorDictModule(nn.Linear(K, K), in_keys=["observation"], out_keys=["embedding"])
     bonus = IntrinsicReward(encoder, normalize=False)
     both = Compose(RedrawDirection(DirectionPrimer(K)), bonus)
@@ -78,7 +78,7 @@ def test_a_buffer_keeps_what_was_followed_and_the_bonus_is_of_what_was_drawn():
     assert torch.equal(buffer.storage[:]["direction"], stored["direction"])
 
 
-def test_it_stands_in_a_sequence_of_modules_and_can_be_cloned():
+def test_works_in_nn_sequential_and_can_be_cloned():
     redraw = RedrawDirection(DirectionPrimer(K), share=0.5)
     model = nn.Sequential(redraw, redraw.clone())
     assert spread(model(transitions(30))["direction"]) > 10
@@ -86,13 +86,13 @@ def test_it_stands_in_a_sequence_of_modules_and_can_be_cloned():
     redraw.load_state_dict(RedrawDirection(DirectionPrimer(K)).state_dict())
 
 
-def test_draws_follow_torch_s_seed():
+def test_same_torch_seed_gives_the_same_directions():
     redraw = RedrawDirection(DirectionPrimer(K))
     first, second = (redraw(transitions(9))["direction"] for _ in range(2))
     assert torch.equal(first, second)  # transitions() seeds
 
 
-def test_misuse_is_one_sentence():
+def test_misuse_is_refused():
     with pytest.raises(ValueError, match=r"share is 1.5.*\[0, 1\]"):
         RedrawDirection(DirectionPrimer(K), share=1.5)
     redraw = RedrawDirection(DirectionPrimer(K))

@@ -102,14 +102,14 @@ class TestRNDBonus(TransformChecks):
         assert (self.transform().inv(data) == data).all()
 
 
-def test_error_is_of_observations_in_deviations_from_their_mean_clipped():
+def test_error_is_of_standardized_and_clipped_observations():
     loss = multiples(obs_rms=statistics(mean=1.0, var=4.0), obs_clip=3.0)
     bonus = RNDBonus(loss, normalize=False, update_statistics=False)
     # (5 - 1) / 2 = 2 and (-99 - 1) / 2, clipped to -3: (2 o)² = 16 and 36.
     assert bonus(transitions([5.0, -99.0]))[KEY].flatten().tolist() == [16.0, 36.0]
 
 
-def test_it_is_what_torchrls_transform_gives_on_the_same_statistics():
+def test_bonus_equals_torchrls_transform_with_the_same_statistics():
     loss = fixed_loss(obs_rms=RunningMeanStd((OBSERVATION_DIM,)))
     networks = loss.target_network, loss.predictor_network
     rollout = TransformedEnv(PointEnv(), RNDTransform(*networks, normalize_obs=False)).rollout(4)
@@ -123,7 +123,7 @@ def test_it_is_what_torchrls_transform_gives_on_the_same_statistics():
 
 
 @pytest.mark.parametrize("update", [True, False])
-def test_statistics_of_observations_grow_in_eval_mode_unless_told_not_to(update):
+def test_observation_statistics_update_in_eval_mode_unless_disabled(update):
     """Of 1 and 3: mean 2 and variance 1, but for the ten-thousandth observation of the start."""
     loss = multiples(obs_rms=RunningMeanStd((1,)))
     bonus = RNDBonus(loss, update_statistics=update).eval()
@@ -133,7 +133,7 @@ def test_statistics_of_observations_grow_in_eval_mode_unless_told_not_to(update)
     assert loss.obs_rms.var.item() == pytest.approx(var, abs=1e-3)
 
 
-def test_the_predictor_is_held_by_reference_and_gets_no_gradient_from_the_bonus():
+def test_predictor_is_held_by_reference_and_bonus_has_no_gradient():
     loss = multiples()
     bonus = RNDBonus(loss)
     assert not list(bonus.parameters())

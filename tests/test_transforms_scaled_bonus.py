@@ -17,7 +17,7 @@ def test_extrinsic_weight_adds_the_task_reward(weight, expected):
     assert data["next", "reward"].item() == 10.0
 
 
-def test_bonus_and_task_reward_are_each_divided_by_their_own_deviation():
+def test_bonus_and_task_reward_are_scaled_separately():
     data = transitions([0.0, 0.0], [1.0, -1.0], [1.0, 1.0], rewards=[10.0, 16.0])
     IntrinsicReward(doubler(), extrinsic_weight=0.5)(data)
     # Bonuses 2 and -2 have a deviation of 2, rewards one of 3.
@@ -25,7 +25,7 @@ def test_bonus_and_task_reward_are_each_divided_by_their_own_deviation():
     torch.testing.assert_close(data["next", "intrinsic_reward"].flatten(), expected)
 
 
-def test_division_keeps_the_sign_and_makes_the_deviation_one():
+def test_scaling_keeps_the_sign_and_gives_unit_deviation():
     ends = 3 + 5 * torch.randn(4_000, generator=torch.Generator().manual_seed(0))
     data = transitions([0.0] * 4_000, ends.tolist(), [1.0] * 4_000)
     bonus = IntrinsicReward(doubler())(data)["next", "intrinsic_reward"].flatten()
@@ -76,13 +76,13 @@ def test_constant_bonus_is_not_blown_up():
         assert data["next", "intrinsic_reward"].item() == pytest.approx(10.0, rel=1e-4)
 
 
-def test_without_updates_a_fresh_transform_leaves_the_bonus_as_it_is():
+def test_bonus_is_unscaled_before_any_update():
     transform = IntrinsicReward(doubler(), update_statistics=False)
     data = transform(transitions([0.0, 0.0], [1.0, -3.0], [1.0, 1.0]))
     assert data["next", "intrinsic_reward"].flatten().tolist() == [2.0, -6.0]
 
 
-def test_statistics_go_on_in_eval_mode_and_stop_when_told():
+def test_statistics_update_in_eval_mode_until_disabled():
     env = TransformedEnv(
         PointEnv(), Compose(DirectionPrimer(K), IntrinsicReward(fixed_encoder(), decay=0.9))
     )

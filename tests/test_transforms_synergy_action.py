@@ -54,7 +54,7 @@ class TestSynergyActionUnderTheActionKey(LatentActionChecks):
     test_two_collector_workers_collect = None
 
 
-def test_nested_synergy_leaves_no_empty_node_behind():
+def test_nested_action_key_leaves_no_empty_node():
     transform = SynergyAction(fixed_decoder(), action_key=("agent", "action"))
     env = TransformedEnv(PointEnv(nested=True), transform)
     assert list(env.full_action_spec.keys(True)) == ["synergy"]
@@ -64,7 +64,7 @@ def test_nested_synergy_leaves_no_empty_node_behind():
     assert set(rollout["agent"].keys()) == {"observation"}
 
 
-def test_changed_decoder_weights_act_at_the_very_next_step():
+def test_changed_decoder_weights_apply_at_the_next_step():
     decoder = fixed_decoder()
     env = TransformedEnv(PointEnv(), SynergyAction(decoder))
     state = env.reset().set("synergy", torch.ones(D))
@@ -98,7 +98,7 @@ def test_residual_widens_the_synergy():
     torch.testing.assert_close(executed, decode(rollout["synergy"], decoder))
 
 
-def test_root_at_reset_is_zero_brought_into_the_bounds():
+def test_executed_action_at_reset_is_zero_clipped_to_the_bounds():
     env = TransformedEnv(
         PointEnv((2,), low=0.25, high=1.0), SynergyAction(fixed_decoder(low=0.25, high=1.0))
     )
@@ -106,7 +106,7 @@ def test_root_at_reset_is_zero_brought_into_the_bounds():
 
 
 @pytest.mark.parametrize("native", [False, True])
-def test_a_reset_of_one_env_returns_only_that_one_to_rest(native):
+def test_partial_reset_clears_the_executed_action_of_that_env_only(native):
     env = TransformedEnv(PointEnv((3,)), SynergyAction(fixed_decoder()))
     state = env.rollout(2)[:, -1]["next"].exclude("reward")
     before = state["executed_action"].clone()
@@ -116,7 +116,7 @@ def test_a_reset_of_one_env_returns_only_that_one_to_rest(native):
     assert torch.equal(after["executed_action"][[0, 2]], before[[0, 2]])
 
 
-def test_repr_says_what_decodes_into_what():
+def test_repr_names_decoder_and_keys():
     shown = repr(SynergyAction(fixed_decoder()))
     assert "SynergyDecoder of 2 numbers into 5 actuators in [-1, 1]" in shown
     assert "decoded_key='action'" in shown
@@ -176,7 +176,7 @@ class TestMismatchIsRefusedAtAttachment:
         attach(PointEnv(), transform).rollout(1)
 
 
-def test_bounds_that_differ_between_actuators_are_compared_one_by_one():
+def test_bounds_are_compared_per_actuator():
     low = [-1.0, -1.0, 0.0, 0.0, 0.0]
     env = PointEnv(low=torch.tensor(low))
     attach(env, SynergyAction(fixed_decoder(low=low)))
@@ -184,7 +184,7 @@ def test_bounds_that_differ_between_actuators_are_compared_one_by_one():
         attach(env, SynergyAction(fixed_decoder(low=low[::-1])))
 
 
-def test_serial_env_checks_too():
+def test_mismatch_is_refused_around_a_serial_env():
     with pytest.raises(ValueError, match="writes 7 actuators"):
         attach(SerialEnv(2, PointEnv), SynergyAction(fixed_decoder(7)))
 

@@ -24,7 +24,7 @@ def test_uniform_actions_spread_evenly_over_the_bounds():
     torch.testing.assert_close(drawn.std(0), expected, atol=0.05, rtol=0)
 
 
-def test_deterministic_actions_pass_uncounted():
+def test_deterministic_actions_are_unchanged_and_not_counted():
     warmup = UniformWarmup(Bounded(-1, 1, shape=(2,)), 4)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         data = warmup(TensorDict({"action": torch.full((4, 2), 7.0)}, [4]))
@@ -37,7 +37,7 @@ def test_a_negative_number_of_frames_is_refused():
         UniformWarmup(Bounded(-1, 1, shape=(2,)), -1)
 
 
-def test_a_stage_begins_with_uniform_synergies_and_then_follows_its_policy():
+def test_stage_starts_with_uniform_synergies_then_uses_its_policy():
     stage = learn_stage(None, "learn.init_random_frames=64")
     with torch.no_grad():  # a policy that emits the upper bound
         for parameter in stage.learner.actor.parameters():
@@ -59,6 +59,6 @@ def test_a_resumed_stage_does_not_warm_up_again():
     stage.close()
 
 
-def test_workers_share_the_frames_of_a_run():
+def test_frames_per_action_counts_async_workers_and_action_repeat():
     assert frames_per_action({"kind": "async", "num_workers": 3}, action_repeat=2) == 6
     assert frames_per_action({"kind": "single", "num_workers": 3}, action_repeat=2) == 2

@@ -64,7 +64,7 @@ def flexing(env):
     return TensorDictModule(pull, ["observation"], ["action"])
 
 
-def test_tendons_have_the_colours_of_their_muscles_activations(recorder, env, flexing):
+def test_tendons_are_colored_by_muscle_activation(recorder, env, flexing):
     recorder.record(flexing, 1)
     model, data = mujoco_state(env)
     tendon = int(mujoco.mjtObj.mjOBJ_TENDON)
@@ -78,16 +78,14 @@ def test_tendons_have_the_colours_of_their_muscles_activations(recorder, env, fl
     assert (np.subtract(*expected.T[[0, 2]]) > 0.3).all(), "red, after 0.3 s of full excitation"
 
 
-def test_frames_are_25_to_a_simulated_second_and_the_first_and_the_last_are_there(
-    recorder, env, flexing
-):
+def test_recording_has_25_frames_per_second_with_first_and_last(recorder, env, flexing):
     (frames,) = recorder.record(flexing, 1)
     assert frames.shape == (1 + 7 + 1, 16, 20, 3)  # at 0, 0.04 to 0.28, and 0.3 s
     assert frames.dtype == np.uint8
     assert mujoco_state(env)[1].time == pytest.approx(0.3, abs=0.03)
 
 
-def test_the_episodes_that_are_drawn_are_those_of_the_evaluation(recorder, env, flexing):
+def test_recorded_episodes_are_those_of_the_evaluation(recorder, env, flexing):
     before = torch.get_rng_state()
     recorder.record(flexing, 2)
     drawn = mujoco_state(env)[1].qpos.copy()
@@ -99,7 +97,7 @@ def test_the_episodes_that_are_drawn_are_those_of_the_evaluation(recorder, env, 
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_the_camera_keeps_the_hand_in_the_middle_and_the_room_out(recorder, env):
+def test_scene_shows_the_body_and_not_the_room(recorder, env):
     recorder.draw()
     model, _ = mujoco_state(env)
     scene = recorder._renderer.scene
@@ -111,7 +109,7 @@ def test_the_camera_keeps_the_hand_in_the_middle_and_the_room_out(recorder, env)
     assert not any(model.geom_bodyid[geom] == 0 and untouched[geom] for geom in shown)
 
 
-def test_the_camera_looks_where_its_azimuth_says(env, monkeypatch):
+def test_azimuth_sets_the_view_direction(env, monkeypatch):
     monkeypatch.setattr(mujoco, "Renderer", Blind)
     with EpisodeRecorder(env, size=(16, 20), azimuth=90.0) as recorder:
         recorder.draw()
@@ -120,7 +118,7 @@ def test_the_camera_looks_where_its_azimuth_says(env, monkeypatch):
     np.testing.assert_allclose(ahead, [0.0, np.cos(down), -np.sin(down)], atol=1e-6)
 
 
-def test_all_that_is_drawn_of_a_body_is_framed_and_nothing_else():
+def test_framing_covers_only_the_visible_geoms_of_the_body():
     # A body whose box stands on its origin, a large sphere of it that is not drawn, and a floor.
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="3 0 0"><freejoint/>
@@ -137,7 +135,7 @@ def test_all_that_is_drawn_of_a_body_is_framed_and_nothing_else():
 
 
 @pytest.mark.slow
-def test_stairs_are_there_before_the_renderer_takes_them_over(monkeypatch):
+def test_terrain_is_set_before_the_renderer_reads_it(monkeypatch):
     heights = []
 
     class Terrain(Blind):
@@ -150,12 +148,12 @@ def test_stairs_are_there_before_the_renderer_takes_them_over(monkeypatch):
     assert heights[0] > 0.5
 
 
-def test_a_camera_that_is_not_there_is_answered_with_those_that_are(env):
+def test_unknown_camera_is_refused_with_the_known_ones(env):
     with pytest.raises(ValueError, match="no camera 'moon'; the model has none"):
         EpisodeRecorder(env, camera="moon")
 
 
-def test_without_a_gl_library_the_packages_are_named(env, monkeypatch):
+def test_missing_gl_library_error_names_the_packages(env, monkeypatch):
     def refuse(*_):
         raise OSError("libEGL.so.1 not found")
 
@@ -164,7 +162,7 @@ def test_without_a_gl_library_the_packages_are_named(env, monkeypatch):
         EpisodeRecorder(env)
 
 
-def test_a_video_and_an_animated_picture_show_the_same_and_nothing_else_is_left(tmp_path):
+def test_video_and_animation_are_written_without_leftovers(tmp_path):
     brightness = np.arange(0, 225, 25, dtype=np.uint8)[:, None, None, None]
     episode = np.broadcast_to(brightness, (9, 16, 32, 3))
     clips = [episode[:4], episode]
@@ -192,7 +190,7 @@ def test_a_video_and_an_animated_picture_show_the_same_and_nothing_else_is_left(
         ("video=1", "video"),
     ],
 )
-def test_a_wrong_setting_is_one_sentence_before_anything_is_made(
+def test_invalid_video_setting_gives_a_one_line_error_and_no_files(
     setting, words, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
@@ -202,7 +200,7 @@ def test_a_wrong_setting_is_one_sentence_before_anything_is_made(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_task_without_a_body_is_said_before_the_evaluation(tmp_path, monkeypatch, capsys):
+def test_video_of_a_task_without_mujoco_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "egl")
     assert command("evaluate.py", "zoo=overactuated", "episodes=1", "video=true") != 0
@@ -210,7 +208,7 @@ def test_a_task_without_a_body_is_said_before_the_evaluation(tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
-def test_an_untrained_entry_has_other_networks_and_the_same_synergies():
+def test_untrained_entry_has_new_networks_and_the_same_synergies():
     fresh, trained = zoo.untrained("overactuated"), zoo.load("overactuated")[0]
     old, new = trained.state_dict(), fresh.state_dict()
     of_decoder = next(

@@ -53,12 +53,12 @@ def draw(server: viser.ViserServer, skin: str) -> Body:
 
 
 @pytest.mark.parametrize(("skin", "faces"), [(SKIN, [4]), ("", [])])
-def test_a_hidden_bone_is_drawn_under_a_skin_alone_and_a_hidden_ball_never(server, skin, faces):
+def test_hidden_bone_is_drawn_only_under_a_skin(server, skin, faces):
     sent = [BytesIO(handle.glb_data) for handle, _ in draw(server, skin)._parts]
     assert [len(trimesh.load_mesh(file, file_type="glb").faces) for file in sent] == faces
 
 
-def test_the_camera_takes_in_a_tendon_that_reaches_beyond_the_body(server):
+def test_camera_frames_a_tendon_beyond_the_body(server):
     draw(server, SKIN)
     camera = server.initial_camera
     view = camera.look_at - camera.position

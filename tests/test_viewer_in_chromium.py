@@ -89,7 +89,7 @@ def press(tab, name: str, until: Callable[[], bool]) -> bool:
     return False
 
 
-def test_the_page_loads_and_names_the_muscles_without_an_error(browser, page):
+def test_page_loads_and_lists_the_muscles(browser, page):
     tab, faults = browser
     tab.get_by_text("Synergies").first.wait_for()
     tab.get_by_text(page.session.subject.actuators[0]).first.wait_for()
@@ -97,7 +97,7 @@ def test_the_page_loads_and_names_the_muscles_without_an_error(browser, page):
     assert faults == []
 
 
-def test_a_slider_moves_the_muscle_that_it_names(browser, page):
+def test_slider_moves_its_muscle(browser, page):
     tab, faults = browser
     before = page.session.data.act.copy()
     tab.get_by_role("slider").first.press("End")
@@ -116,7 +116,7 @@ def test_play_advances_the_episode_until_pause(browser, page):
     assert faults == []
 
 
-def test_a_closed_browser_pauses_and_the_page_stays(browser, page):
+def test_closing_the_browser_pauses_the_session(browser, page):
     tab, _ = browser
     page.session.playing = True
     tab.close()

@@ -45,7 +45,7 @@ def by_a_person(page: Page, label: str, value: object = None) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["myo2HandPose", "myoLegStairTerrainWalk", "dog-run"])
-def test_a_slider_moves_a_body_that_is_drawn(name):
+def test_slider_moves_and_recolors_the_drawn_body(name):
     page = open_page(name)
     try:
         placed, shapes = page.body._placed.copy(), page.body._shapes
@@ -59,7 +59,7 @@ def test_a_slider_moves_a_body_that_is_drawn(name):
         page.close()
 
 
-def test_what_moves_a_followed_body_stays_where_the_body_is_drawn():
+def test_joints_are_drawn_at_a_followed_body():
     page = open_page("humanoid-stand")
     try:
         body, data = page.body, page.session.data
@@ -76,7 +76,7 @@ def test_what_moves_a_followed_body_stays_where_the_body_is_drawn():
         page.close()
 
 
-def test_a_random_direction_is_drawn_as_often_as_a_person_asks():
+def test_every_click_draws_another_direction():
     act = lambda observation, direction: observation.new_zeros(1)  # noqa: E731
     explorer = TensorDictModule(act, ["observation", "direction"], ["action"])
     page = open_page(SMALL, explorer=explorer, direction_dim=3)
@@ -92,7 +92,7 @@ def test_a_random_direction_is_drawn_as_often_as_a_person_asks():
         page.close()
 
 
-def test_a_goal_that_cannot_be_built_is_told_and_the_menu_goes_back():
+def test_failed_goal_shows_its_error_and_restores_the_menu():
     def make(goal):
         if goal == "random":
             raise ValueError("no such simulator")

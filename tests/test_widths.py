@@ -43,7 +43,7 @@ def fine_tune(action):
         (RunningNorm(3).see, torch.zeros(4, 6), r"values has shape \[4, 6\].* must be 3"),
     ],
 )
-def test_another_width_is_refused(use, given, words):
+def test_wrong_last_dimension_is_refused(use, given, words):
     if isinstance(use, GMVAELoss):
         given = TensorDict({"action": given}, given.shape[:1])
     with pytest.raises(ValueError, match=words):

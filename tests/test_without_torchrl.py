@@ -40,7 +40,7 @@ def bundle(tmp_path):
 
 
 @pytest.mark.parametrize("residual", [0.0, 0.5])
-def test_the_wrapper_does_what_the_transform_does(residual):
+def test_wrapper_equals_the_transform(residual):
     wrapped = SynergyActionWrapper(gymnasium.make(TASK), decoder(residual))
     transformed = TransformedEnv(make_env("overactuated"), SynergyAction(decoder(residual)))
     transformed.set_seed(3)
@@ -88,7 +88,7 @@ def test_actions_at_bounds_in_double_precision_stay_inside(step, synergy):
     step(SynergyDecoder.from_directions(torch.zeros(5), far, low=-0.3, high=0.3), synergy)
 
 
-def test_gymnasium_s_checker_finds_no_fault(bundle):
+def test_wrapper_passes_gymnasiums_checker(bundle):
     env = SynergyActionWrapper(gymnasium.make(TASK), bundle)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -105,7 +105,7 @@ def test_a_residual_of_a_bundle_can_be_left_out(bundle):
     assert env.action_space.shape == (3,)
 
 
-def test_the_muscles_of_a_bundle_must_be_the_environment_s(tmp_path):
+def test_bundle_must_fit_the_muscles_of_the_environment(tmp_path):
     names = [f"other_{i}" for i in range(16)]
     bundle = save_bundle(decoder(), tmp_path / "synergies", task="toy", actuators=names)
     env = gymnasium.make(TASK)
@@ -124,12 +124,12 @@ def test_the_muscles_of_a_bundle_must_be_the_environment_s(tmp_path):
         (SynergyDecoder(3, 16, low=0.0), r"acts in \[0, 1\] but the environment in \[-1, 1\]"),
     ],
 )
-def test_a_decoder_of_another_body_is_one_sentence(given, words):
+def test_decoder_of_another_body_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
         SynergyActionWrapper(gymnasium.make(TASK), given)
 
 
-def test_actions_that_are_no_flat_box_are_one_sentence():
+def test_discrete_action_space_is_refused():
     with pytest.raises(ValueError, match="continuous actuators"):
         SynergyActionWrapper(gymnasium.make("CartPole-v1"), decoder())
 
@@ -152,7 +152,7 @@ def blocks() -> tuple[str, str, str]:
     return policy, synergies, agent
 
 
-def test_the_page_runs_with_stable_baselines3_among_the_peers(tmp_path):
+def test_page_runs_with_stable_baselines3(tmp_path):
     if not PEERS.exists():
         pytest.skip("Stable-Baselines3 is not installed; make .venv-peers/.complete installs it.")
     environ = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -161,7 +161,7 @@ def test_the_page_runs_with_stable_baselines3_among_the_peers(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_the_gymnasium_part_of_the_page_runs_here_and_names_no_torchrl(tmp_path, monkeypatch):
+def test_gymnasium_part_of_the_page_runs_and_imports_no_torchrl(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     block = "\n".join(blocks()[:2])
     exec(compile(block, str(PAGE), "exec"), {"__name__": "__main__"})

@@ -45,7 +45,7 @@ def exported(run):
 
 
 @pytest.mark.parametrize("kind", ["synergies=pca", "exploration=metra"])
-def test_a_run_of_another_kind_than_the_default_is_read_as_it_was(kind, tmp_path):
+def test_saved_config_of_another_kind_is_read_unchanged(kind, tmp_path):
     made = Experiment(tiny(f"run_dir='{tmp_path}/run'", kind))
     made.folder.open(resume=False)
     made.folder.close()
@@ -64,7 +64,7 @@ def observations(size: int) -> TensorDict:
     return TensorDict({"observation": torch.randn(5, size, generator=generator)}, [5])
 
 
-def test_the_synergies_of_the_hand_fit_all_tasks_of_the_hand():
+def test_myohand_synergies_fit_all_hand_tasks():
     _, info = load_bundle(zoo.synergies("myohand"))
     for task in ("myoHandPose", "myo2HandPose", "myoHandKeyTurn", "myoHandPenTwirl"):
         spec = EnvironmentSpec.of(make_env(task))
@@ -74,7 +74,7 @@ def test_the_synergies_of_the_hand_fit_all_tasks_of_the_hand():
 
 
 @pytest.mark.parametrize("name", zoo.names(trained=True))
-def test_every_entry_repeats_the_numbers_of_its_card(name):
+def test_every_entry_repeats_the_returns_on_its_card(name):
     policy, env = zoo.load(name)
     card, again = zoo.read_card(name), 2
     found = evaluate_task(policy, env, card.task, episodes=again)
@@ -88,7 +88,7 @@ def test_every_entry_repeats_the_numbers_of_its_card(name):
 
 
 @pytest.mark.parametrize("name", zoo.names(trained=True))
-def test_the_intervals_of_a_card_are_those_of_its_episodes(name):
+def test_card_intervals_follow_from_its_episodes(name):
     told = zoo.read_card(name).evaluation
     found = Evaluation(**told["episodes"]).summary()
     assert found.keys() == told.keys()
@@ -100,7 +100,7 @@ def test_the_intervals_of_a_card_are_those_of_its_episodes(name):
 
 
 @pytest.mark.parametrize("name", zoo.names(trained=True))
-def test_the_command_of_a_card_is_one_of_today_for_its_task(name):
+def test_card_command_is_valid_for_its_task(name):
     card = zoo.read_card(name)
     told = shlex.split(card.training["command"])
     config = composed(translate([*told[2:], "run_dir=unused"], CONF))
@@ -111,7 +111,7 @@ def test_the_command_of_a_card_is_one_of_today_for_its_task(name):
     )
 
 
-def test_the_page_tells_how_the_synergies_of_the_hand_were_made():
+def test_zoo_page_states_the_facts_of_myohand():
     info = json.loads((zoo.synergies("myohand") / "synergies.json").read_text("utf-8"))
     page = (ROOT / "docs" / "zoo.md").read_text(encoding="utf-8")
     (told,) = (line for line in page.splitlines() if line.startswith("`myohand` was explored"))
@@ -122,7 +122,7 @@ def test_the_page_tells_how_the_synergies_of_the_hand_were_made():
         assert f"{facts[key]:.3f}" in told, key
 
 
-def test_an_entry_holds_the_run_s_own_policy_and_bundle(run, exported):
+def test_exported_entry_holds_the_policy_and_bundle_of_the_run(run, exported):
     card = zoo.read_card(exported)
     assert (
         card.training["frames"]
@@ -145,7 +145,7 @@ def test_an_entry_holds_the_run_s_own_policy_and_bundle(run, exported):
     )
 
 
-def test_a_policy_acts_without_noise_unless_it_is_asked_for(exported):
+def test_loaded_policy_is_deterministic_unless_exploring(exported):
     policy, _ = zoo.load(exported)
     rows = observations(6)
     assert torch.equal(policy(rows.clone())["action"], policy(rows.clone())["action"])
@@ -153,7 +153,7 @@ def test_a_policy_acts_without_noise_unless_it_is_asked_for(exported):
         assert not torch.equal(policy(rows.clone())["action"], policy(rows.clone())["action"])
 
 
-def test_loading_leaves_the_global_random_numbers_alone(exported):
+def test_loading_leaves_the_global_rng_unchanged(exported):
     torch.manual_seed(0)
     expected = torch.rand(3)
     torch.manual_seed(0)
@@ -162,7 +162,7 @@ def test_loading_leaves_the_global_random_numbers_alone(exported):
 
 
 @pytest.mark.parametrize("method", ["sac", "dynsyn", "lattice", "lattice_plain", "sar", "eme"])
-def test_the_policy_of_every_method_is_built_again(method):
+def test_policy_of_every_method_is_rebuilt(method):
     experiment = Experiment(
         tiny(ELBOW, f"method={method}", "run_dir=unused", *BRIEFLY.get(method, []))
     )
@@ -175,7 +175,7 @@ def test_the_policy_of_every_method_is_built_again(method):
         torch.testing.assert_close(policy(rows.clone())["action"], expected)
 
 
-def test_a_method_that_does_not_tell_of_its_actor_is_one_sentence(monkeypatch):
+def test_actor_that_its_method_does_not_describe_is_refused(monkeypatch):
     experiment = Experiment(tiny(ELBOW, "method=lattice", "run_dir=unused"))
     learner = experiment.method.stage().learner
     monkeypatch.setattr(experiment.method, "actor", lambda: {"kind": "gaussian"})
@@ -193,7 +193,7 @@ def test_a_method_that_does_not_tell_of_its_actor_is_one_sentence(monkeypatch):
         ["+env_kwargs.words=['a,b','1','it\\'s (so)',\"x\"]", "success_key='a=b'"],
     ],
 )
-def test_the_command_on_a_card_makes_the_same_configuration(overrides):
+def test_card_command_gives_the_same_config(overrides):
     made = tiny("run_dir=unused", *overrides)
     told = shlex.split(command_of(made, composed, CONF, "toy"))
     assert told[:2] == ["python", "recipes/etl_sac.py"]
@@ -220,16 +220,14 @@ def place_aside(config) -> dict:
     return plain
 
 
-def test_given_synergies_are_those_of_the_entry(exported):
+def test_card_command_names_the_synergies_of_the_entry(exported):
     made = tiny("run_dir=unused", f"synergies=zoo:{exported}")
     assert Experiment(made).config.num_synergies == 2
     assert "synergies=zoo:toy" in command_of(made, composed, CONF, "toy")
     assert str(exported) not in command_of(made, composed, CONF, "toy")
 
 
-def test_the_command_on_a_card_names_the_recipes_file_of_a_kind_whatever_stands_in_conf(
-    tmp_path, monkeypatch
-):
+def test_card_command_ignores_a_local_conf_folder(tmp_path, monkeypatch):
     (own := tmp_path / "conf" / "synergies").mkdir(parents=True)
     (own / "a_wide.yaml").write_text("kind: nmf")
     (own / "broken.yaml").write_text("a: [")
@@ -239,7 +237,7 @@ def test_the_command_on_a_card_names_the_recipes_file_of_a_kind_whatever_stands_
 
 
 @pytest.mark.parametrize("choice", ["synergies=zoo:{}", "method=sac", "method=lattice"])
-def test_the_command_of_a_run_that_explored_nothing_makes_the_same_configuration(choice, exported):
+def test_card_command_of_a_run_without_stage_1_gives_the_same_config(choice, exported):
     made = Experiment(tiny("run_dir=unused", choice.format(exported))).config
     told = shlex.split(command_of(made, composed, CONF, exported))
     again = Experiment(composed(translate([*told[2:], "run_dir=unused"], CONF))).config
@@ -281,26 +279,26 @@ def swap_weights(entry, value=0.0):
         (lambda entry: (entry / "card.json").unlink(), "holds synergies alone"),
     ],
 )
-def test_a_damaged_or_foreign_entry_is_one_sentence(damage, words, entry):
+def test_damaged_or_foreign_entry_gives_a_one_line_error(damage, words, entry):
     damage(entry)
     with pytest.raises(ZooError, match=words) as caught:
         zoo.load(entry)
     assert "\n" not in str(caught.value)
 
 
-def test_a_policy_is_refused_on_another_body(exported):
+def test_policy_on_another_body_is_refused(exported):
     with pytest.raises(ZooError, match=r"reads 6 observations and the environment gives"):
         zoo.load(exported, env=make_env("cheetah-run"))
 
 
-def test_an_entry_does_not_replace_what_is_none(run, tmp_path):
+def test_export_into_a_folder_that_is_no_entry_is_refused(run, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(ZooError, match=r"holds 'thesis.tex'"):
         export_run(run, tmp_path, composed, CONF, episodes=1)
     assert (tmp_path / "thesis.tex").exists()
 
 
-def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
+def test_export_and_evaluate_commands(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert command("export.py", f"run={run}", "name=toy", "episodes=2") == 0
     assert "zoo.load('zoo/toy')" in capsys.readouterr().out
@@ -313,9 +311,7 @@ def test_the_commands_export_and_evaluate(run, tmp_path, monkeypatch, capsys):
         zoo.load("hand")
 
 
-def test_an_entry_on_a_task_of_one_s_own_needs_its_name_from_a_person(
-    exported, tmp_path, monkeypatch, capsys
-):
+def test_entry_of_a_custom_task_requires_env_from_the_user(exported, tmp_path, monkeypatch, capsys):
     shutil.copytree(exported, tmp_path / "toy")
     task = json.loads((tmp_path / "toy" / "card.json").read_text())["task"]
     rewrite(tmp_path / "toy", task={**task, "name": "own_toys:OwnToy-v0"})
@@ -347,7 +343,7 @@ def test_an_entry_on_a_task_of_one_s_own_needs_its_name_from_a_person(
         ("etl_sac.py", ["synergies=zoo:nowhere", "env=overactuated"], "The zoo has no 'nowhere'"),
     ],
 )
-def test_what_cannot_be_exported_or_evaluated_is_one_sentence(
+def test_invalid_export_and_evaluate_arguments_are_refused(
     recipe, arguments, words, run, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
