@@ -1,4 +1,4 @@
-"""Every method of conf/method runs from its file, charges what it takes, and goes on."""
+"""Every method of conf/method: settings, options, charged frames, and resuming."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RIVALS = [name for name in METHODS if not name.startswith("etl") and not name.en
 def test_every_method_file_names_itself_and_builds_an_experiment(method, tmp_path):
     made = tiny(f"method={method}", "run_dir=unused", ELBOW)
     assert made.method.name == method
-    if made.synergies.bundle is not None:  # of the body, or made by a script of studies/
+    if made.synergies.bundle is not None:  # made on the body or by a script of studies/
         spec = EnvironmentSpec.of(make_env(made.env))
         bounds = {"low": spec.low.tolist(), "high": spec.high.tolist()}
         decoder = SynergyDecoder(2, spec.action_dim, hidden=(8,), **bounds)
@@ -72,7 +72,7 @@ def test_etl_refuses_more_synergies_than_actuators():
         Experiment(tiny("env=cheetah-run", "num_synergies=7", "run_dir=unused"))
 
 
-# What their public code says, in the project's words.
+# Values in the authors' public code, under this project's names of settings.
 PUBLISHED = {
     "lattice_paper": {
         "method.options.state_dependent": True,
@@ -140,7 +140,7 @@ def test_baseline_charges_its_frames_and_resumes_with_the_same_numbers(
     monkeypatch.undo()
     Experiment(resumed_config(broken), resume=broken).run()
     ours, theirs = numbers(broken), numbers(whole)
-    if method == "dep":  # the controller's memory is that of a body, which no checkpoint holds
+    if method == "dep":  # the memory of DEP belongs to a simulation, which no checkpoint holds
         assert ours.keys() == theirs.keys()
     else:
         assert ours == theirs
@@ -320,7 +320,7 @@ def test_shuffled_groups_keep_the_group_sizes_of_dynsyn(tmp_path):
 def test_dynsyn_amplitude_schedule_scales_with_the_budget(tmp_path):
     stage = Experiment(rival("dynsyn", tmp_path / "run")).method.stage()
     network = stage.learner.actor[0].module
-    assert stage.budget == 408  # 608 without the recording; a third of it is 136
+    assert stage.budget == 408  # 608 less the recording; the schedule starts at a third, 136
     for frames, amplitude in ((0, 0.0), (136, 0.0), (272, 0.05), (408, 0.1)):
         stage.progress.frames = frames
         set_frames(stage.learner.actor, frames)
@@ -334,7 +334,7 @@ def test_dynsyn_evaluates_with_the_amplitude_of_the_last_batch(tmp_path):
     experiment.run()
     stage = experiment.learned()
     network = next(m for m in stage.learner.policy.modules() if isinstance(m, DynSynNetwork))
-    assert 0.08 < network.amplitude <= 0.1  # that of the last batch's first frame
+    assert 0.08 < network.amplitude <= 0.1  # as at the first frame of the last batch
 
 
 def test_dynsyn_paper_preset_has_the_published_amplitude(tmp_path):

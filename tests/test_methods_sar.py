@@ -1,4 +1,4 @@
-"""SAR plays first, and learns on what its best episodes did."""
+"""SAR: the play stage, its best episodes, and the bundle made of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_etl.training import alone
 from torchrl_etl.training.loop import StopOnSignal
 
 
-def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
+def rollout_batch(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorDict:
     following = {
         "done": torch.tensor(done),
         "episode_reward": torch.tensor(so_far),
@@ -25,8 +25,10 @@ def fresh(episodes: list[int], so_far: list[float], done: list[bool]) -> TensorD
 
 
 def test_finished_episodes_are_found_with_their_returns():
-    far = 5 + (2 << 32)  # an episode of another machine
-    rows = fresh([3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True])
+    far = 5 + (2 << 32)  # an episode number of another machine
+    rows = rollout_batch(
+        [3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True]
+    )
     found = finished_episodes(rows)
     assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
     assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
@@ -35,11 +37,11 @@ def test_finished_episodes_are_found_with_their_returns():
 
 def test_sar_keeps_later_episodes_above_the_percentile_of_the_preview(tmp_path):
     sar = Experiment(rival("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
-    # One step an episode: 10 and 0 are the preview, whose 80th percentile is 8; its own 10 is not
-    # taken, and 9 is though 11 is better.
-    rows = fresh([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
+    # Every episode has one step. 10 and 0 are the preview, whose 80th percentile is 8: of the
+    # later returns 9, 7 and 11, those of 9 and 11 are kept.
+    rows = rollout_batch([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
     assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
-    # Of two episodes one is the preview at most, and of one none.
+    # The preview is half of the episodes at most: one of two, none of one.
     assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
     assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
 

@@ -1,4 +1,4 @@
-"""Networks: bounds, shapes, densities, and a GMVAE that finds synergies known in advance."""
+"""Networks: bounds, shapes, densities, and a GMVAE that recovers planted synergies."""
 
 from __future__ import annotations
 
@@ -152,9 +152,9 @@ def test_likelihood_scale_has_a_floor_and_can_grow_again() -> None:
     gmvae = GMVAE(4, 2, hidden=(8,))
     nn.init.constant_(gmvae.likelihood_log_scale, -4.5)
     torch.testing.assert_close(gmvae.likelihood_scale, torch.full((4,), -4.0).exp())
-    # Far from what it decodes: descent widens the scale, though it is below the floor.
+    # Large errors: gradient descent raises the scale, although it is below the floor.
     assert (gradient_of_log_scale(gmvae, uniform(64)) < 0).all()
-    # On what it decodes exactly, descent would narrow it without end.
+    # No error: descent would lower the scale without limit, so the gradient is 0 at the floor.
     for parameter in gmvae.decoder.parameters():
         nn.init.zeros_(parameter)
     assert (gradient_of_log_scale(gmvae, torch.zeros(64, 4)) == 0).all()
@@ -198,7 +198,7 @@ def test_state_encoder_is_invariant_to_the_scale_of_the_observation() -> None:
     data = TensorDict({"observation": torch.randn(2, 4, 5)}, [2, 4])
     latent = encoder(data)["latent"]
     assert latent.shape == (2, 4, 3) and encoder.embedding_dim == 3
-    # The first layer is normalized: but for its bias, a thousandfold input changes nothing.
+    # The first layer is normalized: without its bias, scaling the input changes nothing.
     first = encoder.module[0]
     nn.init.zeros_(first.bias)
     torch.testing.assert_close(
@@ -244,7 +244,7 @@ def test_log_prob_is_the_density_of_the_samples_in_action_units(low: float, high
     sample, log_prob = distribution.rsample_and_log_prob((50_000,))
     assert ((sample >= low) & (sample <= high)).all()
     torch.testing.assert_close(log_prob, distribution.log_prob(sample), atol=1e-2, rtol=1e-2)
-    # Share of the samples below each quarter against the integral up to there.
+    # Share of the samples below each quarter of the range against the integral of the density.
     for quarter in (0.25, 0.5, 0.75):
         below = grid <= low + quarter * (high - low)
         share = (sample <= low + quarter * (high - low)).float().mean().item()
@@ -288,7 +288,7 @@ def test_quiet_entries_have_a_fixed_standard_deviation() -> None:
     distribution = actor.get_dist(TensorDict({"observation": torch.randn(7, 3)}, [7]))
     assert (distribution.scale[:, 2:] == 0.02).all() and (distribution.scale[:, :2] > 0.5).all()
     distribution.scale.sum().backward()
-    weight = actor[0].module[-3].weight.grad  # of the head: five means, five deviations
+    weight = actor[0].module[-3].weight.grad  # of the head: five means, five standard deviations
     assert (weight[:5] == 0).all() and (weight[7:] == 0).all() and (weight[5:7] != 0).any()
 
 

@@ -1,4 +1,4 @@
-"""BehavioralMetricLoss: the check list, its numbers, its options."""
+"""BehavioralMetricLoss: the checks of a loss, values by hand, options."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 
@@ -28,7 +28,7 @@ class MetricChecks(LossChecks):
     targets = {"target_encoder_params"}
     recorded = {("next", "observation"), ("next", "reward")}
     trained = {"loss_metric": {"encoder_params"}, "loss_regularizer": {"encoder_params"}}
-    # Far more than the rewards' spread, so that pairs are regularized.
+    # Far above the differences of rewards, so that pairs are regularized.
     options: dict[str, Any] = {"epsilon": 1.0, "margin": 3.0}
 
     def make_loss(self, *, nested: bool = False, **kwargs: Any) -> BehavioralMetricLoss:
@@ -86,7 +86,7 @@ class TestGaussian(MetricChecks):
         return [GaussianDynamics(EMBEDDING_DIM, hidden=(16,))]
 
 
-# Numbers on a lookup table of embeddings
+# Values on a lookup table of embeddings
 
 
 ROWS = [0.0, 0.0], [3.0, 4.0], [0.0, 6.0]
@@ -224,7 +224,7 @@ def test_bootstrapped_distances_stay_bounded(divergence: str) -> None:
         sum(value for key, value in out.items() if key.startswith("loss_")).backward()
         optimizer.step()
         updater.step()
-    # No pseudometric of these rewards exceeds the largest difference going on forever.
+    # No pseudometric exceeds the largest difference of rewards, discounted over all time.
     bound = (data["next", "reward"].max() - data["next", "reward"].min()) / (1 - gamma)
     assert 0.5 < out["mean_distance"] < bound
     assert out["effective_rank"] > 1.0

@@ -1,4 +1,4 @@
-"""DecoderLoss: the check list, and what Eq. 10 does and does not do."""
+"""DecoderLoss: the checks of a loss, and the gradient of Eq. 10 on fresh and stale pairs."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 

@@ -1,4 +1,4 @@
-"""GMVAELoss: the check list, its numbers, its learning."""
+"""GMVAELoss: the checks of a loss, its terms, and training."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 
@@ -76,7 +76,7 @@ def test_action_units_do_not_change_the_loss() -> None:
 
 
 def test_latents_are_sampled_inside_the_loss() -> None:
-    # TorchRL turns exploration off inside losses; a VAE without its noise is no VAE.
+    # TorchRL turns exploration off inside losses, but a VAE must sample its latents.
     loss, data = GMVAELoss(GMVAE(ACTION_DIM, LATENT_DIM)), actions()
     assert loss(data)["loss_gmvae"] != loss(data)["loss_gmvae"]
 
@@ -107,7 +107,7 @@ def test_training_recovers_planted_synergies() -> None:
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
-    # The loss trains the very model it was given.
+    # The loss trains the model it was given, not a copy.
     with torch.no_grad():
         residual = (gmvae.reconstruct(action) - action).square().sum()
     assert 1 - residual / (action - action.mean(0)).square().sum() > 0.8

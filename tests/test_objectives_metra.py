@@ -1,4 +1,4 @@
-"""METRALoss: the check list, its numbers, where its dual variable goes."""
+"""METRALoss: the checks of a loss, values by hand, and its Lagrange multiplier."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 
@@ -48,7 +48,7 @@ class TestMeanNorm(TestMETRALoss):
         return super().make_loss(norm="mean", **kwargs)
 
 
-# Numbers on a lookup table of embeddings
+# Values on a lookup table of embeddings
 
 
 def transitions(
@@ -64,7 +64,7 @@ DIRECTION = [[0.6, 0.8]]
 
 
 @pytest.mark.parametrize(
-    ("norm", "step", "bonus", "room"),
+    ("norm", "step", "bonus", "slack"),
     [
         ("sum", LONG, 5.0, 1 - 25),
         ("mean", LONG, 5.0, 1 - 12.5),
@@ -72,11 +72,11 @@ DIRECTION = [[0.6, 0.8]]
         ("mean", SHORT, 0.5, 0.001),
     ],
 )
-def test_losses_by_hand(norm: str, step: tuple, bonus: float, room: float) -> None:
+def test_losses_by_hand(norm: str, step: tuple, bonus: float, slack: float) -> None:
     loss = METRALoss(table(*ROWS), norm=norm, lambda_init=30.0, epsilon=0.001)
     out = loss(transitions(*step, DIRECTION, 3))
-    assert out["loss_representation"].item() == pytest.approx(-(bonus + 30 * room), rel=1e-4)
-    assert out["loss_lambda"].item() == pytest.approx(math.log(30) * room, rel=1e-4)
+    assert out["loss_representation"].item() == pytest.approx(-(bonus + 30 * slack), rel=1e-4)
+    assert out["loss_lambda"].item() == pytest.approx(math.log(30) * slack, rel=1e-4)
     assert out["mean_bonus"].item() == pytest.approx(bonus, rel=1e-4)
     assert out["mean_step"].item() == pytest.approx(bonus, rel=1e-4)
     assert out["multiplier"].item() == pytest.approx(30.0)
@@ -102,7 +102,7 @@ def test_lambda_rises_for_long_steps_and_falls_for_short_ones(step: tuple, rises
     before = loss.log_lambda.item()
     loss(data)["loss_lambda"].backward()
     optimizer.step()
-    # By 1 - 25 at once, by no more than epsilon back.
+    # A long step raises it by 25 - 1; a short one lowers it by epsilon at most.
     assert loss.log_lambda.item() - before == pytest.approx(24.0 if rises else -0.001, rel=0.02)
     assert loss(data)["multiplier"] > 0
 
@@ -111,7 +111,7 @@ def test_slack_beyond_epsilon_gives_no_gradient() -> None:
     loss = METRALoss(table(*ROWS), epsilon=0.5)
     loss(transitions(*SHORT, DIRECTION, 3))["loss_representation"].backward()
     gradient = next(loss.encoder_params.parameters()).grad
-    # Row 2 minus row 1 along the direction, and no pull to make the step shorter.
+    # The gradient of the bonus alone: row 2 minus row 1, along the direction.
     torch.testing.assert_close(gradient[2], -torch.tensor(DIRECTION[0]))
     torch.testing.assert_close(gradient[1], torch.tensor(DIRECTION[0]))
 
@@ -138,7 +138,7 @@ def test_steps_on_a_chain_converge_to_the_bound(
     out = loss(data)
     assert out["mean_step"].item() == pytest.approx(length, rel=0.05)
     assert out["mean_bonus"].item() == pytest.approx(length, rel=0.05)
-    # Ends of the chain are as far apart as there are steps between them.
+    # The ends of the chain are as far apart as the steps between them add up to.
     rows = next(loss.encoder_params.parameters())
     apart = (rows[-1] - rows[0]).norm().item()
     assert apart == pytest.approx((states - 1) * length, rel=0.05)

@@ -1,4 +1,4 @@
-"""Losses name an entry that the data lacks, and what makes an action of it that will do."""
+"""Losses name the entry that the data lacks and, for an action, the transform that adds it."""
 
 from __future__ import annotations
 

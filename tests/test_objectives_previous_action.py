@@ -1,4 +1,4 @@
-"""Losses that would pair a synergy with the action of the step before say so."""
+"""Losses warn of keys that pair a synergy with the action of the previous step."""
 
 from __future__ import annotations
 

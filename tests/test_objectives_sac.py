@@ -1,4 +1,4 @@
-"""LeanSACLoss: the check list, and TorchRL's own SACLoss number for number."""
+"""LeanSACLoss: the checks of a loss, and the values and gradients of TorchRL's SACLoss."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_critic_size_that_differs_from_the_support_is_refused(
 
 
 class Value(nn.Module):
-    """Q-values [*, 1] of an action that may come in two parts; a second output beside them."""
+    """Q-values [*, 1] of an action in one or two parts, with further outputs if asked for."""
 
     def __init__(self, *, outputs: int = 1) -> None:
         super().__init__()
@@ -179,7 +179,7 @@ def hooked() -> TensorDictModule:
 
 
 def composite_actor(**parts: Any) -> ProbabilisticActor:
-    """Of the parts "left" [*, 2] and "right" [*, 3] of an action."""
+    """An actor of two parts of an action, "left" [*, 2] and "right" [*, 3]."""
 
     class Parameters(nn.Module):
         def __init__(self) -> None:
@@ -210,7 +210,7 @@ def assert_same_numbers(actor: Any, critic: Any, data: TensorDict) -> None:
         torch.manual_seed(SEED)
         batch = data.clone()
         out = loss(batch)
-        if kind is LeanSACLoss:  # TorchRL's leaves loc and scale
+        if kind is LeanSACLoss:  # TorchRL's also writes loc and scale
             assert set(batch.keys(True)) == {*data.keys(True), "td_error"}
         sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()
         gradients = {k: v.grad for k, v in loss.named_parameters() if v.grad is not None}
@@ -282,7 +282,7 @@ def test_fused_soft_update_equals_torchrls_soft_update(rate: dict[str, float]) -
 def test_critic_of_terminal_transitions_converges_to_the_minimum(
     options: dict[str, Any], fixed_point: float
 ) -> None:
-    """One in ten pays 100: the mean is 10; smooth-L1's minimum is where 9 q = 1."""
+    """One of ten rewards is 100: squared error has its minimum at 10, smooth L1 where 9 q = 1."""
     torch.manual_seed(SEED)
     loss = make_loss(**options)
     SoftUpdate(loss, tau=0.1)
@@ -300,7 +300,7 @@ def test_critic_of_terminal_transitions_converges_to_the_minimum(
 
 
 def test_squared_error_has_no_factor_half_and_sums_over_critics() -> None:
-    """Stable-Baselines3 takes half of it."""
+    """Stable-Baselines3 has a factor 1/2."""
     loss = make_loss()
     SoftUpdate(loss, tau=0.1)
     data = TestLeanSACLoss().data((4,))

@@ -1,4 +1,4 @@
-"""SynergySACLoss: the check list, keys and wiring."""
+"""SynergySACLoss: the checks of a loss, its keys, and how its networks connect."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 
@@ -79,9 +79,9 @@ class TestSynergySACLoss(LossChecks):
     }
     targets = {"target_qvalue_network_params"}
     recorded = {("next", "observation"), ("next", "reward")}
-    # The value estimator looks at done only where terminated is missing.
+    # The value estimator reads done only if terminated is missing.
     optional_keys = {("next", "done"), ("next", "terminated")}
-    written = {"td_error"}  # the priorities, as every TorchRL loss on Q-values does
+    written = {"td_error"}  # priorities, as in every TorchRL loss on Q-values
     kept = {"log_alpha"}
     options: dict[str, Any] = {}
 
@@ -105,7 +105,7 @@ class TestWithoutVmap(TestSynergySACLoss):
     options = {"deactivate_vmap": True}
 
 
-# Keys and wiring
+# Keys and connections
 
 
 def test_in_keys_have_a_fixed_order() -> None:
@@ -141,7 +141,7 @@ def test_action_key_that_the_critic_reads_is_refused() -> None:
         ({"in_keys": ["z"]}, "synergy", "action"),
         ({}, "action", "action"),
         ({}, "synergy", "muscles"),
-        ({"in_keys": ["loc"]}, "synergy", "action"),  # the actor writes it, but it is no sample
+        ({"in_keys": ["loc"]}, "synergy", "action"),  # written by the actor, but not its sample
     ],
 )
 def test_decoder_that_does_not_connect_actor_and_critic_is_refused(

@@ -1,4 +1,4 @@
-"""SynergySACLoss: which action each of its parts sees, against the same written out by hand."""
+"""SynergySACLoss: the action that each part reads, against losses composed by hand."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tests.loss_checks import SEED
 from tests.test_objectives_synergy_sac import ACTION, GAMMA, SYNERGIES, make_data, make_loss
 from torchrl_etl.objectives import SynergySACLoss
 
-# What the loss should be, composed by hand from its networks.
+# The expected losses, composed by hand from the networks.
 
 
 def fresh_synergy(loss: SynergySACLoss, data: TensorDict) -> tuple[Tensor, Tensor]:
-    """The draw that the loss makes from the same seed, and the log-probability of what it does."""
+    """The sample that the loss draws from the same seed, and its log-probability as an action."""
     distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
     torch.manual_seed(SEED)
     synergy, log_prob = distribution.rsample_and_log_prob()
@@ -36,7 +36,7 @@ def fresh_synergy(loss: SynergySACLoss, data: TensorDict) -> tuple[Tensor, Tenso
 
 
 def action_of(loss: SynergySACLoss, synergy: Tensor) -> Tensor:
-    """Through the decoder's own parameters, those an optimizer would move."""
+    """Decode with the decoder's parameters, which an optimizer updates."""
     return loss.decoder_network.module(synergy)
 
 
@@ -87,7 +87,7 @@ def move(params: Any, by: float = 0.5) -> None:
                 value.add_(by * torch.randn_like(value))
 
 
-@pytest.fixture(params=[0.0, 0.3], ids=["synergies", "with a residual"])
+@pytest.fixture(params=[0.0, 0.3], ids=["synergies", "residual"])
 def loss(request: pytest.FixtureRequest) -> SynergySACLoss:
     loss = make_loss(loss_function="l2", alpha_init=0.3, residual=request.param)
     SoftUpdate(loss, tau=0.1)
@@ -130,7 +130,7 @@ def test_entropy_includes_only_the_counted_coefficients(data) -> None:
 
 
 def test_a_replayed_transition_is_valued_at_its_executed_action(loss, data) -> None:
-    data["synergy"] = torch.rand(16, SYNERGIES)  # as the buffer has it, and not Dec⁻¹(action)
+    data["synergy"] = torch.rand(16, SYNERGIES)  # as in a buffer: not the code of the action
     data["next", "terminated"][:] = True  # no bootstrap: what is left is Q(s, a) - r
     before = qvalue_loss(loss, data)
     move(loss.decoder_network_params)
@@ -175,7 +175,7 @@ def test_actor_gradient_equals_the_explicit_composition(loss, data) -> None:
         actor_loss(loss, data), [*actor, *decoder], allow_unused=True, materialize_grads=False
     )
     assert all(gradient is None for gradient in frozen[len(names) :])
-    # The actor learns the same, whether or not the decoder does.
+    # The gradient of the actor is the same with a frozen decoder.
     for ours, theirs in zip(frozen[: len(names)], reached[: len(names)], strict=True):
         torch.testing.assert_close(ours, theirs)
 
@@ -231,7 +231,9 @@ def test_actor_loss_by_hand() -> None:
     log_prob = -0.5 * noise.square() - 0.5 * torch.log(torch.tensor(2 * torch.pi))
     # 3u + 8u against 20 - 2u.
     value = torch.minimum(11 * u, 20 - 2 * u)
-    assert (value[0] - 11 * u[0]).abs() < 1e-6 < (value[1] - 11 * u[1]).abs()  # one of each
+    assert (
+        (value[0] - 11 * u[0]).abs() < 1e-6 < (value[1] - 11 * u[1]).abs()
+    )  # either critic is the smaller one once
     out = actor_loss(loss, data)
     torch.testing.assert_close(out, (0.5 * log_prob - value).mean())
     out.backward()
@@ -244,7 +246,7 @@ def test_actor_loss_by_hand() -> None:
 
 
 def rebuilt(loss: SynergySACLoss) -> SynergySACLoss:
-    """Another loss with the same state and nothing else in common."""
+    """A new loss with the same state dict."""
     torch.manual_seed(99)
     other = make_loss(loss_function="l2", residual=loss.decoder_network.residual)
     SoftUpdate(other, tau=0.1)
