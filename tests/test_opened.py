@@ -1,4 +1,4 @@
-"""Runs and bundles that are opened to be looked at."""
+"""Runs, bundles and zoo entries opened in the viewer."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_untrained_policy_is_that_of_the_run_before_stage_2(finished):
 
     experiment = Experiment(OmegaConf.load(finished / "config.yaml"), resume=finished)
     learned = weights(experiment.learned().learner.policy)
-    torch.rand(7)  # whatever was drawn meanwhile
+    torch.rand(7)  # other draws must not matter
     before = weights(experiment.untrained())
     assert torch.equal(before, weights(experiment.method.stage().learner.policy))
     assert not torch.equal(before, learned)

@@ -1,7 +1,7 @@
-"""The recipes as a person runs them: on real muscles, with typos, and in a process of their own.
+"""Recipes from the command line: on MyoSuite models, with mistyped arguments, as processes.
 
-What is printed and what is left is the same in a process of its own and in this one (see
-:func:`command`), which has imported everything; so few tests start one.
+Output and files of a recipe are the same in its own process and in this one (see :func:`command`),
+where everything is imported already, so only a few tests start a process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SMALL = [override for override in TINY if not override.startswith("env=")]
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory) -> Path:
-    """A smoke run of both stages on a MyoSuite hand, with pictures, in a path with a space."""
+    """A smoke run of both stages on a MyoSuite hand, with pictures; its path has a space."""
     folder = tmp_path_factory.mktemp("with a space") / "a run"
     done = process(
         "etl_sac.py",
@@ -107,14 +107,14 @@ def test_evaluate_writes_videos_or_asks_for_a_gl_back_end(hand):
 
 @pytest.mark.slow
 def test_stage_2_learns_another_task_from_a_bundle(hand, tmp_path):
-    decoder, info = load_bundle(hand)  # saved again, as anybody can, without a fact about it
+    decoder, info = load_bundle(hand)  # saved again without facts
     bundle = save_bundle(decoder, tmp_path / "own", task=info.task, actuators=info.actuators)
     settings = ("env=myoHandKeyTurn", "stage=learn", f"synergies='{bundle}'")
     assert command("etl_sac.py", *SMALL, *settings, f"run_dir='{tmp_path}/run'") == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["synergies"]["task"] == "myoHandPoseFixed-v0"
     assert summary["learn"]["frames_charged"] == summary["learn"]["frames"]
-    assert (tmp_path / "run" / "synergies" / "synergies.json").is_file()  # a copy of its own
+    assert (tmp_path / "run" / "synergies" / "synergies.json").is_file()  # a copy of the bundle
 
 
 @pytest.mark.slow

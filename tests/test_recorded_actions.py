@@ -1,4 +1,4 @@
-"""Arrays of recorded actions, as people bring them."""
+"""Recorded actions as NumPy arrays, lists and tensors of any type."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def gmvae() -> GMVAE:
 
 
 def uses():
-    """Whoever takes recorded actions, with one signature."""
+    """Functions of a model and recorded actions, with one signature."""
     yield "fit_gmvae", lambda model, actions: fit_gmvae(model, actions, updates=2)
     yield "from_gmvae", lambda model, actions: SynergyDecoder.from_gmvae(model, actions)
     yield "encode", lambda model, actions: SynergyDecoder.from_gmvae(model).encode(actions)

@@ -1,4 +1,4 @@
-"""Synergies of recordings: files of laboratories, held-out rows, and the command."""
+"""Synergies of recorded muscle activity: files, cross-validation, and the command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MUSCLES = tuple(f"m{i}" for i in range(6))
 
 
 def emg(rows: int = 240, sources: int = 3) -> np.ndarray:
-    """Activity of six muscles in [0, 1] that few sources drive."""
+    """Activity of six muscles in [0, 1], mixed from a few sources."""
     rng = np.random.default_rng(0)
     return rng.random((rows, sources)) @ rng.random((sources, 6)) / sources
 
@@ -131,7 +131,7 @@ def test_folds_keep_trials_together_and_are_balanced():
 
 
 class Mean:
-    """Answers the mean of what it was fitted to."""
+    """A model that reconstructs every row by the mean of the rows it was fitted to."""
 
     def __init__(self, rows):
         self.mean = rows.mean(0)
@@ -143,7 +143,8 @@ class Mean:
 def test_held_out_vaf_is_of_models_fitted_without_the_rows():
     rows = np.array([[0.0], [2.0], [4.0], [6.0]])
     found, model = cross_validate(Mean, rows, folds=2)
-    # Fitted: the mean itself. Held out: 5 for 0 and 2, 1 for 4 and 6: 25 + 9 + 9 + 25 of 20.
+    # Fitted: the mean explains nothing. Held out: 5 predicts 0 and 2, and 1 predicts 4 and 6,
+    # with squared errors of 25 + 9 + 9 + 25 against a variance of 20.
     assert found.fitted == 0.0
     assert found.held_out == pytest.approx(1 - 68 / 20)
     assert found.lowest == found.highest == pytest.approx(1 - 34 / 10)
@@ -153,7 +154,8 @@ def test_held_out_vaf_is_of_models_fitted_without_the_rows():
 def test_fold_of_one_row_has_a_defined_vaf():
     rows = np.array([[0.0], [3.0], [6.0], [7.0]])
     found, _ = cross_validate(Mean, rows, folds=4)
-    # About the mean of all, 4: 16, 1, 4 and 9. Told: 16/3, 13/3, 10/3 and 3, of the other three.
+    # Squares about the mean of all rows, 4: 16, 1, 4 and 9. Each row is predicted by the mean of
+    # the other three: 16/3, 13/3, 10/3 and 3.
     assert found.lowest == pytest.approx(1 - (16 / 9))
     assert found.highest == pytest.approx(1 - (16 / 9))
     row = emg(4, sources=1)

@@ -1,4 +1,4 @@
-"""ReturnScale against sums worked by hand, and over any division into batches."""
+"""ReturnScale: discounted returns by hand, for any division into batches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_scale_is_the_larger_of_std_and_maximum_over_bound(cuts):
 
 
 def test_running_return_follows_the_episode_across_batches():
-    scale = ReturnScale(0.5, bound=1e-3)  # the largest sum decides
+    scale = ReturnScale(0.5, bound=1e-3)  # low, so that the largest return sets the scale
     going = torch.zeros(1, 2, dtype=torch.bool)
     scale.update(torch.tensor([[4.0, 4.0]]), going, torch.tensor([[7, 7]]))  # 4 and 6
     assert scale.largest == 6.0
@@ -52,7 +52,7 @@ def test_forget_drops_running_returns_and_keeps_the_scale():
     scale = seen(2.0)
     scale.forget()
     scale.update(torch.tensor([[20.0], [0.0]]), torch.zeros(2, 1, dtype=torch.bool))
-    assert scale.scale == 10.0  # not 20 + 5.5 / 2, over two
+    assert scale.scale == 10.0  # 20 / 2 and not (20 + 5.5 / 2) / 2
 
 
 def test_rewards_are_unscaled_until_a_return_is_nonzero():

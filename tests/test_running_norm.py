@@ -1,4 +1,4 @@
-"""RunningNorm against the moments of everything seen, over any division into batches."""
+"""RunningNorm: mean and deviation of all values seen, for any division into batches."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The documentation site: its navigation, a strict build, and its pages on a phone.
+"""The documentation site: navigation, a strict build, and its pages on a phone.
 
-The build needs ``make docs``' environment, the browser test Chromium and Playwright as well.
+The build needs the environment of ``make docs``; the browser test also Chromium and Playwright.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ GENERATED = {"index.md", "changelog.md", "api/"}  # by website/pages.py
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 PHONE = {"width": 390, "height": 844}
 PATIENCE = 120.0  # seconds, for a busy machine
-# A list without an empty line before it, a role of reStructuredText, a link of Markdown.
+# Unrendered lists, roles and directives of reStructuredText, links of Markdown.
 LEFT_OVER = re.compile(r"^\s*[-*] |`|\]\(|:(class|func|meth|mod|attr|math):|\.\. \w+::|::$")
 
 
 class Settings(yaml.SafeLoader):
-    """mkdocs.yml without what its tags would import."""
+    """Loads mkdocs.yml without importing what its Python tags name."""
 
 
 Settings.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
@@ -144,7 +144,7 @@ def test_every_page_fits_a_phone_without_errors_or_external_requests(request):
             width = tab.evaluate("document.documentElement.scrollWidth")
             if width > PHONE["width"]:
                 wide.append((page, width))
-            if page == pages[0]:  # each page sorts the whole site for its search: once is enough
+            if page == pages[0]:  # every page indexes the whole site for its search: once is enough
                 tab.route("**/search_index.json", lambda r: r.fulfill(json={**index, "docs": []}))
         chromium.close()
     assert (faults, wide) == ([], [])

@@ -1,4 +1,4 @@
-"""Every kind of synergies, against numbers that were put into the actions."""
+"""Every kind of synergies, against factors planted in the actions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden"
 
 
 def activity(rows: int = 400) -> Tensor:
-    """Of six muscles in [0, 1], from two sources that are never negative."""
+    """Activity of six muscles in [0, 1], mixed from two nonnegative sources."""
     return torch.rand(rows, 2) @ (torch.rand(2, 6) / 2)
 
 
@@ -44,7 +44,7 @@ def test_pca_recovers_two_directions_and_their_ranges_before_tanh() -> None:
     coefficients = (2 * torch.rand(20_000, 2) - 1) * torch.tensor([1.2, 0.4])
     actions = (center + coefficients @ basis).tanh()
     layer = linear(fit_synergies(actions, "pca", 2).decoder(actions))
-    # Rows of 98 % of a uniform range: the larger first, each with either sign.
+    # Columns span 98 % of a uniform range; the larger comes first, signs are arbitrary.
     sizes = layer.weight.norm(dim=0)
     torch.testing.assert_close(sizes, 0.98 * torch.tensor([1.2, 0.4]), rtol=0.02, atol=0)
     overlap = (layer.weight.mT / sizes[:, None]) @ basis.mT
@@ -72,7 +72,7 @@ def test_actions_at_the_bounds_give_a_finite_decoder() -> None:
 
 
 def test_nmf_recovers_planted_factors() -> None:
-    """Each source alone in some rows, and a muscle of its own: the factorization is unique."""
+    """Each source is alone in some rows and in one muscle, so the factorization is unique."""
     parts = torch.tensor([[0.8, 0.0, 0.4, 0.2], [0.0, 0.6, 0.3, 0.9]])
     weights = torch.rand(600, 2) / 2
     weights[:100, 0] = 0.0
@@ -102,13 +102,13 @@ def test_decoder_has_the_models_slope_at_mid_range(kind: str, origin: str) -> No
 
 
 def test_sar_recovers_independent_sources_with_unit_variance() -> None:
-    """Two sources of ±1 in every combination equally often; what mixes them is found."""
+    """Two sources of ±1, every combination equally often: the mixing matrix is recovered."""
     signs = torch.cartesian_prod(torch.tensor([-1.0, 1.0]), torch.tensor([-1.0, 1.0])).repeat(50, 1)
     mixing = torch.tensor([[0.3, 0.1, 0.0], [0.1, -0.3, 0.2]])
     middle = torch.tensor([0.1, 0.2, 0.3])
     model = fit_synergies(middle + signs @ mixing, "sar", 2)
     torch.testing.assert_close(model.mean, middle)
-    found = model.basis[model.basis[:, 2].abs().argsort()]  # either order, either sign
+    found = model.basis[model.basis[:, 2].abs().argsort()]  # order and signs are arbitrary
     torch.testing.assert_close(found.abs(), mixing.abs(), atol=1e-3, rtol=0)
     coefficients = model.coefficients(middle + signs @ mixing)
     torch.testing.assert_close(
@@ -117,7 +117,7 @@ def test_sar_recovers_independent_sources_with_unit_variance() -> None:
 
 
 def test_sar_with_constant_components_keeps_an_orthonormal_basis() -> None:
-    """One source of three muscles: of three components one varies."""
+    """One source of three muscles: one component of three varies."""
     actions = torch.rand(200, 1) @ torch.tensor([[0.5, 0.3, 0.1]])
     model = fit_synergies(actions, "sar", 3, low=0.0, high=1.0)
     torch.testing.assert_close(model.basis @ model.basis.mT, torch.eye(3), atol=1e-5, rtol=0)
@@ -238,7 +238,7 @@ def test_describe_reports_a_collapsed_mixture() -> None:
     numbers, faults = model.describe(torch.rand(10, 6))
     assert numbers == {"effective_components": pytest.approx(4.0, abs=1e-4)} and not faults
     final.bias.data[2] = 50.0
-    actions = torch.rand(9000, 6)  # more than one piece
+    actions = torch.rand(9000, 6)  # more than one chunk
     numbers, faults = describe_synergies(model, model.decoder(actions), actions)
     assert numbers["effective_components"] == pytest.approx(1.0, abs=1e-4)
     assert "collapsed: 1.0 of its 4 components are in use, the largest for 100%" in faults[-1]

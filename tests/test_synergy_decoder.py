@@ -1,4 +1,4 @@
-"""SynergyDecoder: what it takes over, its box of coefficients, and what a residual adds."""
+"""SynergyDecoder: made of a GMVAE or of directions, its range of coefficients, residuals."""
 
 from __future__ import annotations
 
@@ -65,12 +65,13 @@ def test_without_actions_the_box_spans_the_prior() -> None:
 def test_residual_by_hand() -> None:
     decoder = SynergyDecoder(1, 2, low=[0.0, -1.0], high=[1.0, 3.0], hidden=(4,), residual=0.5)
     for parameter in decoder.parameters():
-        nn.init.zeros_(parameter)  # synergies leave both in the middle of their range: (0.5, 1)
+        nn.init.zeros_(parameter)  # synergies decode to the middle of both ranges, (0.5, 1)
     middle = torch.tensor([[0.3, 0.0, 0.0], [0.3, 1.0, -0.5], [0.3, -0.2, 1.0]])
     expected = torch.tensor([[0.5, 1.0], [0.75, 0.5], [0.45, 2.0]])
     torch.testing.assert_close(decoder(middle), expected)
     torch.testing.assert_close(decoder.log_slope(middle), torch.zeros(3))
-    # Now at 0.6 and -0.6 of their half range; (0.6 + 0.5) / 1.3 = 11/13 and (0.6 - 0.5) / 0.7.
+    # Synergies decode to 0.6 and -0.6 in units of the half ranges, and the residual of ±0.5 is
+    # added: (0.6 + 0.5) / 1.3 = 11/13 and (-0.6 + 0.5) / 0.7 = -1/7.
     bias_of_last_layer(decoder).copy_(torch.tensor([0.6, -0.6]).atanh())
     synergy = torch.tensor([[0.3, 1.0, 1.0], [0.3, -1.0, 0.0]])
     unit = torch.tensor([[11 / 13, -1 / 7], [1 / 7, -0.6]])

@@ -1,8 +1,8 @@
-"""Theorem 1 and its cure, measured: what the metric converges to, and what keeps it from nothing.
+"""Theorem 1, measured: the fixed point of the metric, its collapse without reward, and the hinge.
 
-The chain is a cycle: deterministic, its stationary distribution uniform, and a pair of states
-with a given lag is followed by a pair with the same lag, so pairs and their successors have the
-same distribution, which is what Eq. 4 rests on.
+The chain is a deterministic cycle with a uniform stationary distribution. Two states at some lag
+are followed by two states at the same lag, so pairs and their successors have the same
+distribution, as Eq. 4 assumes.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from torchrl_etl.modules import GaussianDynamics, StateEncoder
 from torchrl_etl.objectives import BehavioralMetricLoss
 
 STATES, GAMMA = 6, 0.8
-# One rewarded state: the metric is d(i, j) = u(i) + u(j), a star, which Euclidean space holds
-# without distortion. (Most reward patterns give metrics that no L2 embedding can.)
+# With one rewarded state the metric is d(i, j) = u(i) + u(j), a star, which embeds into Euclidean
+# space without distortion. (Most reward patterns give metrics without an L2 embedding.)
 SPARSE = torch.eye(STATES)[0]
 OTHERS = ~torch.eye(STATES, dtype=torch.bool)
 
@@ -42,7 +42,7 @@ def cycle(reward: Tensor) -> TensorDict:
 
 
 def fixed_point(reward: Tensor) -> Tensor:
-    """Eq. 2 iterated on a table until nothing moves."""
+    """Eq. 2, iterated on a table until it converges."""
     distance = torch.zeros(STATES, STATES)
     for _ in range(200):
         following = distance.roll((-1, -1), (0, 1))
@@ -84,7 +84,7 @@ def test_learned_distances_reach_the_fixed_point_and_its_mean() -> None:
     difference = (SPARSE.unsqueeze(1) - SPARSE).abs()[OTHERS].mean()
     predicted = expected_distance(difference, GAMMA)
     assert learned[OTHERS].mean().item() == pytest.approx(predicted.item(), rel=0.03)
-    # Not only on average: pair by pair.
+    # Not only on average, but for every pair.
     assert (learned - exact)[OTHERS].abs().max() < 0.1 * exact.max()
 
 
@@ -95,8 +95,8 @@ def test_gaussian_divergence_approaches_the_same_mean() -> None:
         for seed in range(3)
     ]
     predicted = fixed_point(SPARSE)[OTHERS].mean()
-    # Less than predicted while two states lie on one another, which hangs on the last bits of a
-    # sum, so on the number of threads: hence the middle of three.
+    # The mean is lower than predicted while two states coincide. Whether they do depends on
+    # rounding, and so on the number of threads: hence the median of three seeds.
     assert max(found) < 1.05 * predicted
     assert sorted(found)[1] > 0.8 * predicted
 
@@ -110,7 +110,7 @@ def test_plain_and_literal_metrics_collapse_without_reward() -> None:
 
 def test_hinge_keeps_states_apart_without_reward() -> None:
     learned = trained_distances(torch.zeros(STATES), 500)
-    # Where metric and hinge balance: (1 - gamma) d = 2 lambda (m - d), at lambda .1 and m 1.
+    # Metric and hinge balance at (1 - gamma) d = 2 lambda (m - d), with lambda 0.1 and m 1.
     balance = 2 * 0.1 / (1 - GAMMA + 2 * 0.1)
     assert learned[OTHERS].mean().item() == pytest.approx(balance, rel=0.1)
     assert learned[OTHERS].min() > 0.5 * balance
