@@ -1,4 +1,4 @@
-"""A buffer comes back row for row, also into one of another size."""
+"""Checkpoints: restored buffers, full disks, and damaged files."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ def rows(start: int, stop: int) -> TensorDict:
     return TensorDict({"a": values, "next": {"b": values * 2}}, [stop - start])
 
 
-def copied(source: TensorDictReplayBuffer, capacity: int, path) -> TensorDictReplayBuffer:
+def save_and_load(source: TensorDictReplayBuffer, capacity: int, path) -> TensorDictReplayBuffer:
     target = buffer(capacity)
-    target.extend(rows(90, 93))  # whatever was there goes
+    target.extend(rows(90, 93))  # replaced by the load
     for one, action in ((source, "save"), (target, "load")):
         checkpoint = Checkpoint().register("buffer", one, adapter=BufferAdapter())
         getattr(checkpoint, action)(path)
     return target
 
 
-@pytest.mark.parametrize("filled", [3, 8, 13])  # partly, exactly, and over the brim
+@pytest.mark.parametrize("filled", [3, 8, 13])  # partly full, full, and wrapped around
 def test_rows_order_and_next_position_survive(filled, tmp_path):
     source = buffer(8)
     for start in range(filled):
         source.extend(rows(start, start + 1))
-    twin = copied(source, 8, tmp_path / "saved")
+    twin = save_and_load(source, 8, tmp_path / "saved")
     for one in (source, twin):
         one.extend(rows(50, 52))
     assert torch.equal(source.storage[:]["a"], twin.storage[:]["a"])
@@ -50,30 +50,30 @@ def test_rows_order_and_next_position_survive(filled, tmp_path):
 
 def test_buffer_of_another_size_loads_the_newest_rows_in_order(tmp_path):
     source = buffer(4)
-    for start in range(6):  # over the brim: 4 and 5 lie before 2 and 3
+    for start in range(6):  # wrapped around: 4 and 5 come before 2 and 3
         source.extend(rows(start, start + 1))
-    larger = copied(source, 6, tmp_path / "larger")
+    larger = save_and_load(source, 6, tmp_path / "larger")
     larger.extend(rows(6, 9))
     assert larger.storage[:]["a"].flatten().tolist() == [8, 3, 4, 5, 6, 7]
-    smaller = copied(source, 3, tmp_path / "smaller")
+    smaller = save_and_load(source, 3, tmp_path / "smaller")
     assert smaller.storage[:]["a"].flatten().tolist() == [3, 4, 5]
 
 
 def test_only_the_filled_part_is_written(tmp_path):
     source = buffer(100_000)
     source.extend(rows(0, 4))
-    copied(source, 4, tmp_path / "saved")
+    save_and_load(source, 4, tmp_path / "saved")
     size = sum(path.stat().st_size for path in (tmp_path / "saved").rglob("*.memmap"))
     assert size < 100  # two floats and an index a row
 
 
 def test_an_empty_buffer_can_be_saved(tmp_path):
-    assert len(copied(buffer(4), 4, tmp_path / "saved")) == 0
+    assert len(save_and_load(buffer(4), 4, tmp_path / "saved")) == 0
 
 
 @pytest.fixture
 def full_disk(monkeypatch):
-    """A disk that takes sparse files of any size, and no byte more."""
+    """A disk on which sparse files can be created, but no space can be reserved."""
 
     def no_space(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -98,7 +98,7 @@ def test_checkpoint_size_counts_every_tensor():
     module = torch.nn.Linear(3, 2)  # 8 floats
     optimizer = torch.optim.Adam(module.parameters())
     module(torch.ones(3)).sum().backward()
-    optimizer.step()  # two moments of each, and a count of steps for two tensors
+    optimizer.step()  # two moments of every float, and a step count of both tensors
     assert _size({"module": module}) == 4 * 8
     assert _size([optimizer]) == 4 * (2 * 8 + 2)
     filled = buffer(10)
@@ -112,7 +112,7 @@ def module(value: float) -> torch.nn.Linear:
     return linear
 
 
-def change(file: Path) -> None:
+def flip_bit(file: Path) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
@@ -132,20 +132,20 @@ def replace_by_file(folder: Path) -> None:
 
 
 DAMAGE = {
-    "a bit of a tensor": lambda folder: change(tensors(folder)),
-    "a bit of a description": lambda folder: change(description(folder)),
-    "a tensor cut short": lambda folder: os.truncate(tensors(folder), 1),
-    "an empty tensor": lambda folder: os.truncate(tensors(folder), 0),
-    "no tensor": lambda folder: tensors(folder).unlink(),
-    "no description": lambda folder: description(folder).unlink(),
-    "no files": lambda folder: [shutil.rmtree(folder), folder.mkdir()],
-    "a file more": lambda folder: (folder / "more.json").write_text("{}"),
-    "a file in its place": replace_by_file,
-    "no seal": lambda folder: (folder / "seal.json").unlink(),
-    "an empty seal": lambda folder: (folder / "seal.json").write_text(""),
-    "a seal of nothing": lambda folder: (folder / "seal.json").write_text("{}"),
-    "a seal that is a list": lambda folder: (folder / "seal.json").write_text("[1]"),
-    "a seal in no encoding": lambda folder: (folder / "seal.json").write_bytes(b"\xff\xfe\x00"),
+    "flipped bit in a tensor": lambda folder: flip_bit(tensors(folder)),
+    "flipped bit in a description": lambda folder: flip_bit(description(folder)),
+    "truncated tensor": lambda folder: os.truncate(tensors(folder), 1),
+    "empty tensor": lambda folder: os.truncate(tensors(folder), 0),
+    "missing tensor": lambda folder: tensors(folder).unlink(),
+    "missing description": lambda folder: description(folder).unlink(),
+    "empty folder": lambda folder: [shutil.rmtree(folder), folder.mkdir()],
+    "extra file": lambda folder: (folder / "more.json").write_text("{}"),
+    "file in place of the folder": replace_by_file,
+    "missing seal": lambda folder: (folder / "seal.json").unlink(),
+    "empty seal": lambda folder: (folder / "seal.json").write_text(""),
+    "seal without entries": lambda folder: (folder / "seal.json").write_text("{}"),
+    "seal that is a list": lambda folder: (folder / "seal.json").write_text("[1]"),
+    "seal that is not UTF-8": lambda folder: (folder / "seal.json").write_bytes(b"\xff\xfe\x00"),
 }
 
 

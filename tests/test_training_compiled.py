@@ -1,4 +1,4 @@
-"""Whatever stops a compilation costs one sentence; the numbers are those of an uncompiled run."""
+"""Compiled updates: a failed compilation warns once, and values are those of eager updates."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_failed_compilation_warns_and_gives_the_uncompiled_values(function, patc
             outs.append(call(x))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            outs.append(call(x))  # says nothing a second time
+            outs.append(call(x))  # warns only once
     torch.manual_seed(0)
     assert torch.equal(torch.stack(outs), torch.stack([function(x), function(x)]))
 
@@ -122,7 +122,7 @@ from concurrent.futures import ThreadPoolExecutor
 from torchrl_etl.learners.compiled import compiled
 warnings.simplefilter("error", RuntimeWarning)
 print(torch.__file__)
-x = torch.zeros(64, requires_grad=True)  # enough for the vector functions of a library
+x = torch.zeros(64, requires_grad=True)  # enough entries for vectorized library functions
 run = lambda: compiled(lambda x: torch.autograd.grad(x.exp().log1p().sum(), x)[0])(x)[:3]
 print(run(), ThreadPoolExecutor(1).submit(run).result())
 """

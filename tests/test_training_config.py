@@ -1,4 +1,4 @@
-"""Every configuration composes; every fault is one sentence that says how to mend it."""
+"""Configurations compose; a setting that cannot be used is refused with its remedy."""
 
 from __future__ import annotations
 
@@ -217,7 +217,9 @@ def test_env_kwargs_reach_the_simulator(tmp_path):
 # Bodies in bfloat16 ----------------------------------------------------------------------------
 
 
-def said(monkeypatch, tmp_path, capabilities: dict[str, bool], *overrides: str) -> list[str]:
+def bfloat16_lines(
+    monkeypatch, tmp_path, capabilities: dict[str, bool], *overrides: str
+) -> list[str]:
     lines = []
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
     config = tiny(f"run_dir='{tmp_path}/run'", "method=sac", *overrides)
@@ -229,7 +231,7 @@ def said(monkeypatch, tmp_path, capabilities: dict[str, bool], *overrides: str) 
 def test_bfloat16_warns_without_hardware_support(network, monkeypatch, tmp_path):
     without = {"avx2": True, "avx512_f": True, "avx512_bf16": False}
     asked = f"{network}.body=residual_bfloat16"
-    assert said(monkeypatch, tmp_path, without, asked) == [
+    assert bfloat16_lines(monkeypatch, tmp_path, without, asked) == [
         "Warning: this processor has no instructions for bfloat16, so body=residual_bfloat16 takes "
         "longer than the same in float32, body=residual."
     ]
@@ -237,11 +239,11 @@ def test_bfloat16_warns_without_hardware_support(network, monkeypatch, tmp_path)
 
 @pytest.mark.parametrize("name", ["avx512_bf16", "amx_bf16", "bf16", "sve_bf16"])
 def test_bfloat16_does_not_warn_with_hardware_support(name, monkeypatch, tmp_path):
-    assert not said(monkeypatch, tmp_path, {name: True}, "actor.body=residual_bfloat16")
+    assert not bfloat16_lines(monkeypatch, tmp_path, {name: True}, "actor.body=residual_bfloat16")
 
 
 def test_float32_does_not_warn(monkeypatch, tmp_path):
-    assert not said(monkeypatch, tmp_path, {}, "actor.body=residual")
+    assert not bfloat16_lines(monkeypatch, tmp_path, {}, "actor.body=residual")
 
 
 @pytest.mark.parametrize(
@@ -297,7 +299,7 @@ def test_former_presets_paths_and_kinds_compose():
         others = compose("config", overrides=[*kinds, "run_dir=unused"])
     assert config == as_null == same
     assert (others.synergies.kind, others.exploration.kind) == ("nmf", "metra")
-    assert "hidden" not in others.synergies, "it brings its kind's settings"
+    assert "hidden" not in others.synergies, "a kind brings its own settings"
 
 
 # Several seeds -----------------------------------------------------------------------------------
@@ -312,7 +314,7 @@ def test_each_of_several_seeds_has_the_folder_of_a_single_run():
         (5, "runs/a-5", False),
     ]
     assert all(own.seeds is None for own in configs)
-    # A process of its own has no Hydra, whose resolvers the default has.
+    # Another process has no Hydra, whose resolvers the default run_dir uses.
     assert not any(OmegaConf.is_interpolation(own, "run_dir") for own in configs)
 
 

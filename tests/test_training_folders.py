@@ -1,4 +1,4 @@
-"""A run holds all that it needs, and what is lost or damaged in its folder is one sentence."""
+"""Run folders are self-contained; lost or damaged files are named when a run is resumed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def finished(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def copy(finished, tmp_path) -> Path:
-    """A finished run, copied elsewhere."""
+    """A copy of a finished run in another folder."""
     return Path(shutil.copytree(finished, tmp_path / "copy"))
 
 
@@ -109,7 +109,7 @@ def test_stage_2_resumes_without_checkpoints_of_stage_1(copy):
 def test_resume_names_a_damaged_file_and_works_without_it(name, content, copy):
     file = copy / name
     file.write_bytes(content)
-    # Only a run without checkpoints asks what was saved.
+    # saved.json is read only if there are no checkpoints.
     away = copy / "checkpoints" / "learn"
     if name == "saved.json":
         away.rename(copy / "away")
@@ -175,7 +175,7 @@ def test_budget_given_on_resume_replaces_either_budget_setting(begun_with, longe
     run = tmp_path / "run"
     Experiment(tiny(f"run_dir='{run}'", "method=sac", f"{begun_with}=320")).run()
     assert resume(run, f"{longer}=640")["learn"]["frames"] == 640
-    assert resume(run)["learn"]["frames"] == 640, "it is the budget from now on"
+    assert resume(run)["learn"]["frames"] == 640, "the budget given on resume is kept"
 
 
 def test_restart_seed_resumes_past_a_diverging_simulation(tmp_path, monkeypatch):
@@ -184,7 +184,7 @@ def test_restart_seed_resumes_past_a_diverging_simulation(tmp_path, monkeypatch)
 
     def noted(env, *, seed=None, options=None):
         if seed is not None:
-            seeds.extend([seed] if seed >= 2**30 else [])  # none of an evaluation
+            seeds.extend([seed] if seed >= 2**30 else [])  # not those of evaluations
             env.diverges = seed in deadly
         return reset(env, seed=seed, options=options)
 
@@ -196,7 +196,7 @@ def test_restart_seed_resumes_past_a_diverging_simulation(tmp_path, monkeypatch)
     monkeypatch.setattr(AnalyticOveractuated, "step", diverging)
     control = ("method=sac", "frames=608")
     Experiment(tiny(f"run_dir='{tmp_path}/whole'", *control)).run()
-    deadly.add(seeds[-1])  # of the episodes that begin after the checkpoint of frame 320
+    deadly.add(seeds[-1])  # of episodes begun after the checkpoint at frame 320
 
     run = tmp_path / "run"
     with pytest.raises(SimulationError, match="go on with resume=RUN restart_seed=1"):

@@ -1,4 +1,4 @@
-"""A run that was killed goes on, and ends with the numbers of one that was not."""
+"""A killed or stopped run resumes and ends with the numbers of an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from torchrl_etl.training import Interrupted, resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints, _digests
 from torchrl_etl.training.stage import Stage
 
-# With all that remembers what was seen, or goes by the frames.
-REMEMBERS = (
+# Options with running statistics, or with a schedule over frames.
+STATEFUL = (
     "learn.sac.normalize_observations=true",
     "learn.sac.return_bound=5",
     "learn.sac.lr_end=0.5",
@@ -40,7 +40,7 @@ REMEMBERS = (
 
 def command(run: Path, *overrides: str) -> list[str]:
     recipe = [sys.executable, str(ROOT / "recipes" / "etl_sac.py")]
-    return [*recipe, *TINY, *REMEMBERS, f"run_dir='{run}'", *overrides]
+    return [*recipe, *TINY, *STATEFUL, f"run_dir='{run}'", *overrides]
 
 
 def start(arguments: list[str], log: Path) -> subprocess.Popen:
@@ -70,7 +70,7 @@ def collected(monkeypatch, experiment: Experiment) -> int:
 def whole(tmp_path_factory) -> Path:
     """A run that nothing interrupted."""
     run = tmp_path_factory.mktemp("whole") / "run"
-    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'")).run()
+    Experiment(tiny(*STATEFUL, f"run_dir='{run}'")).run()
     return run
 
 
@@ -99,13 +99,13 @@ def test_kill_9_in_either_stage_and_resume_gives_the_same_numbers(
     assert not (run / "summary.json").exists()
 
     experiment = Experiment(resumed_config(run), resume=run)
-    assert collected(monkeypatch, experiment) < 2 * 608 - 300, "it went on, it did not start over"
+    assert collected(monkeypatch, experiment) < 2 * 608 - 300, "it resumed and did not start over"
     assert numbers(run) == uninterrupted
 
 
 def test_resume_before_the_first_checkpoint_starts_the_stage_over(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'"))
+    experiment = Experiment(tiny(*STATEFUL, f"run_dir='{run}'"))
     experiment.folder.open(resume=False)
     experiment.folder.log({"explore/return": 1.0, "learn/eval/return": 2.0}, 0)
     Experiment(resumed_config(run), resume=run).run()
@@ -114,7 +114,7 @@ def test_resume_before_the_first_checkpoint_starts_the_stage_over(tmp_path, unin
 
 def test_another_seed_gives_other_numbers(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "seed=1")).run()
+    Experiment(tiny(*STATEFUL, f"run_dir='{run}'", "seed=1")).run()
     other = numbers(run)
     assert other.keys() == uninterrupted.keys()
     assert other["csv/scalars/learn/return.csv"] != uninterrupted["csv/scalars/learn/return.csv"]
@@ -150,14 +150,14 @@ def test_sac_with_learner_options_resumes_with_the_same_numbers(tmp_path):
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_stop_signal_saves_a_checkpoint(number, tmp_path):
-    stopped(tmp_path / "run", *REMEMBERS, number=number)
+    stopped(tmp_path / "run", *STATEFUL, number=number)
     (checkpoint,) = (tmp_path / "run" / "checkpoints").glob("*/*")
     assert checkpoint.name == "checkpoint-000000000224" and (checkpoint / "seal.json").exists()
 
 
 def test_stopped_run_resumes_without_logging_a_frame_twice(tmp_path):
     run = tmp_path / "run"
-    experiment = stopped(run, *REMEMBERS)
+    experiment = stopped(run, *STATEFUL)
     summary = Experiment(resumed_config(run), resume=run).run()
     assert summary["learn"]["frames"] == 608
     frames, _ = experiment.folder.series("explore/updates")
@@ -201,7 +201,7 @@ def test_checkpoint_with_a_pickle_is_not_loaded(copy):
 def test_run_stopped_in_final_fit_or_pictures_resumes(slow_part, tmp_path, monkeypatch):
     run = tmp_path / "run"
     settings = ("pictures=true", "explore.frames=320", slow_part)
-    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", *settings))
+    experiment = Experiment(tiny(*STATEFUL, f"run_dir='{run}'", *settings))
     save = Checkpoints.save
 
     def save_and_signal(self, checkpoint, *, step, **kwargs):
@@ -238,13 +238,13 @@ def test_run_stopped_in_prefill_updates_resumes(tmp_path, monkeypatch):
     assert len(updates) < 600 // 16
     monkeypatch.undo()
     Experiment(resumed_config(run), resume=run).run()
-    own = 608 - 96  # none for the batches up to 100 frames
+    own = 608 - 96  # no updates for the batches up to 100 frames
     assert experiment.folder.series("learn/updates")[1][-1] == (own + 600) // 16
 
 
 def test_run_of_stage_1_resumes_with_stage_2(tmp_path, uninterrupted):
     run = tmp_path / "run"
-    experiment = Experiment(tiny(*REMEMBERS, f"run_dir='{run}'", "stage=explore"))
+    experiment = Experiment(tiny(*STATEFUL, f"run_dir='{run}'", "stage=explore"))
     experiment.run()
     file = experiment.folder.explored
     file.rename(f"{file}.away")
@@ -280,7 +280,7 @@ def test_learner_state_is_bit_exact_after_a_load(name, compile, tmp_path):
     twin = fresh()
     twin.checkpoint().load(tmp_path / "saved")
     rows = []
-    for one in (stage, twin):  # the first is compiled by now, the second is not
+    for one in (stage, twin):  # the first is compiled already, the second is not
         torch.manual_seed(0)
         rows.append(torch.stack([one.update() for _ in range(3)]))
     assert (rows[0] == rows[1]).all()

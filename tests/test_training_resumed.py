@@ -1,4 +1,4 @@
-"""The configuration that a run goes on with, whatever became of it and whatever is asked for."""
+"""The configuration of a resumed run: damaged, older, or with overrides."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_etl.training import resumed_config, validate
 
 @pytest.fixture
 def file(tmp_path) -> Path:
-    """The configuration that a run left."""
+    """The config.yaml in the folder of a run."""
     path = tmp_path / "config.yaml"
     path.write_text(OmegaConf.to_yaml(tiny(f"run_dir='{tmp_path}'", "frames=1000")))
     return path

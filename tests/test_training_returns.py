@@ -24,5 +24,5 @@ def test_returns_are_averaged_over_complete_stretches(tmp_path: Path):
         rows = [list(row.values()) for row in csv.DictReader(file)]
     assert rows == [
         ["task", "sac", "3", "10", "2.0", "c", "m"],
-        ["task", "sac", "3", "20", "5.0", "c", "m"],  # nothing in the next two
+        ["task", "sac", "3", "20", "5.0", "c", "m"],  # no complete stretch after it
     ]

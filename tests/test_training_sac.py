@@ -1,4 +1,4 @@
-"""What the learner of stage 2 and of its rivals can be asked for, the control included."""
+"""Options of the SAC learner, in stage 2 of ETL and in the baselines."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_actor_and_critics_read_normalized_observations(method, tmp_path):
     for prefix in ("", "next."):
         expected = ((seen[f"{prefix}observation"] - mean) / std).clamp(-10, 10).float()
         torch.testing.assert_close(seen[f"{prefix}normalized_observation"], expected)
-    # What acts, in training and in evaluation, reads raw observations and scales them alike.
+    # Policies of training and evaluation read raw observations and normalize them alike.
     observation = {"observation": raw[:5].float()}
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = stage.learner.policy(TensorDict(observation, [5]))
@@ -117,7 +117,7 @@ def test_actor_and_critics_read_normalized_observations(method, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("engine", "oldest"), [("single", 1), ("process", 1), ("distributed", 2)])
 def test_observation_statistics_reach_the_workers_with_the_weights(engine, oldest, tmp_path):
-    # A worker on another machine is asked for a batch before the last one is learned from.
+    # A worker on another machine collects its next batch before the last one is learned from.
     settings = (f"collector={engine}", "collector.ahead=false")
     settings += () if engine == "single" else ("collector.num_workers=1",)
     settings += ("learn.sac.normalize_observations=true", f"run_dir={tmp_path}")
@@ -165,7 +165,7 @@ def test_ema_averages_the_actor_and_collection_uses_the_actor():
     fill(stage)
     averaged = list(stage.learner.ema.module.parameters())
     expected = None
-    for kept in (0, 2 / 11, 3 / 12, 0.25, 0.25):  # (1 + n) / (10 + n), then the share
+    for kept in (0, 2 / 11, 3 / 12, 0.25, 0.25):  # (1 + n) / (10 + n), then ema_decay
         stage.update()
         actor = [weight.detach().clone() for weight in stage.learner.actor.parameters()]
         expected = expected or actor
@@ -193,7 +193,7 @@ def test_ema_with_decay_zero_equals_the_actor():
 
 
 def six_steps(ends_after, begins=0):
-    """Rewards 1 to 6 from observations 0 to 5 (or so many more), an episode ending after a step."""
+    """Observations 0 to 5 (from ``begins``) with rewards 1 to 6; an episode ends after one step."""
     end = (torch.arange(1, 7) == ends_after).view(1, 6, 1)
     observation = begins + torch.arange(7.0).view(1, 7, 1)
     following = {"reward": observation[:, 1:], "observation": observation[:, 1:]}
@@ -202,7 +202,7 @@ def six_steps(ends_after, begins=0):
 
 
 def spans(rows):
-    """Of each transition: where it begins, its reward, where it ends and after how many steps."""
+    """(observation, reward, next observation, number of steps) of each transition."""
     parts = (rows["observation"], rows["next", "reward"], rows["next", "observation"])
     return list(
         zip(*(part.flatten().tolist() for part in (*parts, rows["steps_to_next_obs"])), strict=True)
@@ -213,28 +213,28 @@ def test_n_step_transition_stops_at_the_end_of_an_episode():
     stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
     batch = six_steps(ends_after=3)
     spanned = stage.multi_step(batch)
-    # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4; the last two wait.
+    # By hand: 1 + 2/2 + 3/4, 2 + 3/2, 3 | 4 + 5/2 + 6/4; the last two steps are held back.
     assert spans(spanned) == [(0, 2.75, 3, 3), (1, 3.5, 3, 2), (2, 3.0, 3, 1), (3, 8.0, 6, 3)]
     for end in ("terminated", "done"):
         assert spanned["next", end].flatten().tolist() == [True, True, True, False]
     assert batch["next", "reward"].flatten().tolist() == [1, 2, 3, 4, 5, 6], "logs read the batch"
-    # The target: rewards and, unless the episode ended, γ^k times what follows, here 8.
+    # The target: rewards and, unless the episode ended, γ^k times the next value, here 8.
     target = stage.learner.objective.sac._bootstrap(spanned, torch.full((4,), 8.0))
     assert target.tolist() == [2.75, 3.5, 3.0, 9.0]
     stage.close()
 
 
 def test_n_step_transition_spans_consecutive_batches():
-    for size in (1, 2, 6):  # of the batches that the same 18 steps come in
+    for size in (1, 2, 6):  # of batches of the same 18 steps
         stage = learn_stage(None, "learn.n_steps=3", "learn.sac.gamma=0.5")
         steps = torch.cat([six_steps(ends_after=3, begins=k) for k in (0, 6, 12)], 1)
         rows = torch.cat([stage.multi_step(part) for part in steps.split(size, 1)])
         whole = MultiStep.forward(stage.multi_step, steps)
         assert spans(rows) == spans(whole)[:16]
-        # Episodes begin anew, as after a checkpoint: what waits is dropped.
+        # Episodes begin anew, as after a checkpoint: steps held back are dropped.
         stage.restart_collection()
         assert spans(stage.multi_step(six_steps(ends_after=3)))[0] == (0, 2.75, 3, 3)
-        # Another worker's batch: what waits spans the steps that are known.
+        # Another worker's batch: steps held back become shorter transitions.
         other = spans(stage.multi_step(six_steps(ends_after=0, begins=50)))
         assert other[:3] == [(4, 8.0, 6, 2), (5, 6.0, 6, 1), (50, 51 + 52 / 2 + 53 / 4, 53, 3)]
         stage.close()
@@ -250,7 +250,7 @@ def test_buffer_stores_step_counts_only_for_n_step_returns():
     rows = stage.buffer.storage[:].clone()
     assert set(rows["steps_to_next_obs"].flatten().tolist()) == {1, 2, 3}
     assert stage.update()["loss_qvalue"].isfinite()
-    # What stage 1 has collected is of single steps.
+    # Transitions of stage 1 span single steps.
     stage.prefill(rows.select("observation", "synergy", "action", "next"))
     assert set(stage.newest(len(rows))["steps_to_next_obs"].flatten().tolist()) == {1}
     assert stage.update()["loss_qvalue"].isfinite()

@@ -1,4 +1,4 @@
-"""Order, freshness, and who learns what in the two stages."""
+"""The two stages: transitions kept, networks in use, and parameters that each update trains."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_prefill_copies_transitions_of_stage_1_and_adds_their_updates(tmp_path):
     stage.checkpoint().load(max((tmp_path / "run" / "checkpoints" / "learn").glob("checkpoint-*")))
     rows = stage.buffer.storage[:]
     assert len(rows) == 600 + 608
-    own = 608 - 96  # none for the batches up to 100 frames
+    own = 608 - 96  # no updates for the batches up to 100 frames
     assert stage.progress.updates == (own + 600) // 16
     first = rows[:600]
     explored = Explorer(experiment.context).stage
@@ -158,7 +158,7 @@ def test_gmvae_is_fitted_to_the_configured_actions(actions):
     found = explorer(f"explore.fit.actions={actions}", "exploration.relabel=0")
     stage = found.stage
     batch = stage.collect()
-    with torch.no_grad():  # as learning would
+    with torch.no_grad():  # in place of learning
         for parameter in stage.learner.behavior.parameters():
             parameter.mul_(1.5)
         now = stage.learner.behavior(batch.select("observation", "direction"))["loc"]
@@ -179,7 +179,7 @@ def test_synergies_are_fitted_to_actions_on_normalized_observations():
 
 
 def test_final_updates_are_adam_steps_of_the_synergy_model_alone():
-    found, twin = explorer(), explorer()  # of the same seed
+    found, twin = explorer(), explorer()  # with the same seed
     fill(found.stage)
     learner = found.stage.learner
     others = learner.objective.sac, learner.ema, found.exploration.encoder

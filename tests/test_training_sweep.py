@@ -1,4 +1,4 @@
-"""The queue: what is finished stays, what broke goes on, and nothing is counted twice."""
+"""The queue of a sweep: finished runs are kept, others resumed, and no row is written twice."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def results(out: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def results_of_a_queue_that_was_killed(arguments, out: Path, *runs: str) -> list[dict[str, str]]:
-    """Kill it as soon as these runs have saved once, and start it again."""
+def results_of_a_killed_sweep(arguments, out: Path, *runs: str) -> list[dict[str, str]]:
+    """Kill the sweep as soon as these runs have a checkpoint, and start it again."""
     running = begun("sweep.py", *arguments, cwd=out.parent)
     wait_until(lambda: all(has_saved(out / run, "learn") for run in runs), running)
     running.kill()
@@ -55,7 +55,7 @@ def test_killed_sweep_resumes_and_finishes_every_run(tmp_path):
     out = tmp_path / "a sweep"
     what = ["tasks=[overactuated]", "methods=[sac,etl]", "seeds=[0]", "frames=900", "jobs=2"]
     arguments = [*what, f"settings={' '.join(SMALL)}", f"out={out}"]
-    rows = results_of_a_queue_that_was_killed(arguments, out, "overactuated-sac-seed0")
+    rows = results_of_a_killed_sweep(arguments, out, "overactuated-sac-seed0")
     assert {row["method"] for row in rows} == {"sac", "etl"}
     assert {row["status"] for row in rows} == {"finished"}
     frames = {m: [int(row["frames"]) for row in rows if row["method"] == m] for m in ("sac", "etl")}
@@ -75,7 +75,7 @@ def test_killed_sweep_of_seeds_in_one_process_resumes(tmp_path):
     what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0,1]", "frames=900", "jobs=1"]
     what += ["seeds_at_once=true", f"settings={' '.join(SMALL)}", f"out={out}"]
     runs = [f"overactuated-sac-seed{seed}" for seed in (0, 1)]
-    rows = results_of_a_queue_that_was_killed(what, out, *runs)
+    rows = results_of_a_killed_sweep(what, out, *runs)
     assert {(row["seed"], row["status"]) for row in rows} == {("0", "finished"), ("1", "finished")}
     assert [row["return"] for row in rows if row["seed"] == "0"] != [
         row["return"] for row in rows if row["seed"] == "1"
@@ -119,7 +119,7 @@ def test_run_begun_with_other_settings_is_refused(tmp_path):
     for _ in Sweep([run], tmp_path / "out", jobs=1, attempts=1):
         pass
     other = replace(run, command=[run.command[0], "lr=2"])
-    Sweep([other], tmp_path / "out", jobs=1).stop()  # it failed before it began: a typo, mended
+    Sweep([other], tmp_path / "out", jobs=1).stop()  # the run failed before it began
     (run.path / "config.yaml").write_text("frames: 9")
     words = r"begun with other settings \(lr=1, lr=2\); give another out=FOLDER"
     with pytest.raises(ValueError, match=words):

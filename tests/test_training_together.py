@@ -1,4 +1,4 @@
-"""Runs of several seeds in one process are the runs that each seed would have been by itself."""
+"""Several seeds in one process give the runs that each seed gives alone."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def work(run: Path, seed: int, *settings: str, stop: StopOnSignal | None = None)
 
 
 def one_after_another(group: SideBySide, inputs) -> list:
-    """The same updates, each by itself: without rounding otherwise."""
+    """The same updates one learner at a time, with the rounding of single runs."""
     return [each.updates(own) for each, own in zip(group.learners, inputs, strict=True)]
 
 
@@ -126,4 +126,4 @@ def test_all_seeds_stop_at_a_signal_and_resume_together(tmp_path, monkeypatch):
     count = lambda group, inputs: passes.append(len(inputs)) or updates(group, inputs)  # noqa: E731
     monkeypatch.setattr(SideBySide, "updates", count)
     assert [end["learn"]["frames"] for end in together(goes_on)] == [416, 416]
-    assert len(passes) > 5 and {*passes} == {2}  # they had stopped a batch apart
+    assert len(passes) > 5 and {*passes} == {2}  # although they had stopped one batch apart
