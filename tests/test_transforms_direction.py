@@ -1,3 +1,5 @@
+"""DirectionPrimer: the checks of a transform, distributions, seeds, and refused arguments."""
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -35,7 +37,7 @@ class TestDirectionPrimer(TransformChecks):
             firsts.append(direction[0])
         assert len({tuple(first.tolist()) for first in firsts}) == len(firsts)
 
-    # Two processes share torch's fixed default seed, so distinct draws need a set_seed.
+    # Processes share torch's default seed, so set_seed is needed for distinct draws.
     @pytest.mark.slow
     def test_parallel_env_of_transformed_envs_keeps_its_specs(self):
         parallel = ParallelEnv(2, self.env, mp_start_method="fork")

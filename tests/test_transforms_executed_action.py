@@ -1,4 +1,4 @@
-"""SynergyAction: which synergy, decoded and executed action a batch holds together."""
+"""SynergyAction: a batch pairs synergy, decoded and executed action of the same step."""
 
 from functools import partial
 
@@ -34,8 +34,8 @@ def collect(env, **kwargs):
     return batch
 
 
-def pairs(batch, decoder=None):
-    """Asserts that root synergy and root action belong together."""
+def assert_paired(batch, decoder=None):
+    """The root action is the decoded root synergy."""
     torch.testing.assert_close(batch["action"], decode(batch["synergy"], decoder))
 
 
@@ -55,9 +55,9 @@ def test_collected_root_pairs_synergy_and_action_of_one_step(layout, kwargs):
     }[layout]()
     decoder = fixed_decoder(16 if layout == "no device" else ACTION_DIM)
     env = TransformedEnv(env, SynergyAction(decoder))
-    for steps in (1, 3):  # a collector does not change what rollouts and resets are
+    for steps in (1, 3):  # rollouts before collection must not matter
         env.rollout(steps)
-    pairs(collect(env, **kwargs), decoder)
+    assert_paired(collect(env, **kwargs), decoder)
 
 
 def keep_at_root():
@@ -66,7 +66,7 @@ def keep_at_root():
 
 def test_multi_step_keeps_pairs():
     make = partial(TransformedEnv, PointEnv(), SynergyAction(fixed_decoder()))
-    pairs(collect(make(), postproc=MultiStep(0.9, 3)))
+    assert_paired(collect(make(), postproc=MultiStep(0.9, 3)))
 
 
 def test_multi_step_after_a_rename_keeps_pairs_of_workers():
@@ -76,7 +76,7 @@ def test_multi_step_after_a_rename_keeps_pairs_of_workers():
     batch = collect(
         SerialEnv(2, transformed), postproc=nn.Sequential(keep_at_root(), MultiStep(0.9, 3))
     )
-    pairs(batch)
+    assert_paired(batch)
 
 
 @pytest.mark.parametrize("collected", [True, False])
@@ -89,13 +89,13 @@ def test_multi_step_transform_of_a_buffer_keeps_pairs(collected):
         storage=LazyTensorStorage(20), transform=MultiStepTransform(3, 0.9), batch_size=8
     )
     buffer.extend(batch)
-    pairs(buffer.sample())
+    assert_paired(buffer.sample())
     moved = buffer[:]["next", "executed_action"] - decode(buffer[:]["synergy"])
     assert moved.abs().max() > 1e-3
 
 
 class _Clip(Transform):
-    """Halves the range that the simulator gets, as an inner safety clip would."""
+    """A safety clip that halves the range of executed actions."""
 
     def __init__(self) -> None:
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])

@@ -1,4 +1,4 @@
-"""IntrinsicReward: the check list of a transform, its numbers, what it refuses."""
+"""IntrinsicReward: the checks of a transform, its values, and refused arguments."""
 
 import copy
 import io
@@ -47,7 +47,7 @@ class TestIntrinsicReward(TransformChecks):
         encoder = fixed_encoder()
         assert "_intrinsic_reward_observation" not in rollout.keys() or (
             "collector" not in rollout.keys()
-        ), "collectors leave the private copy out"
+        ), "collectors drop the private copy"
         with torch.no_grad():
             embedding = encoder(rollout.select("observation"))["embedding"]
             following = encoder(rollout["next"].select("observation"))["embedding"]
@@ -63,7 +63,7 @@ class TestIntrinsicReward(TransformChecks):
         return multi_step
 
     def check_multi_step(self, moved, plain):
-        # Of 12 steps in episodes of 4: three rewards, or those that are left of the episode.
+        # 12 steps in episodes of 4: three rewards, or fewer at the end of an episode.
         key = ("next", "intrinsic_reward")
         bonus = plain[key].view(3, HORIZON)
         padded = torch.cat([bonus, torch.zeros(3, 2)], 1)
@@ -111,7 +111,7 @@ class TestIntrinsicReward(TransformChecks):
             "deviation.mean",
             "deviation.variance",
             "deviation.weight",
-        }, "the encoder is its trainer's to save"
+        }, "the encoder is saved by its trainer"
         second.load_state_dict(first.state_dict())
         for transform in (first, second):
             transform.update_statistics = False
@@ -290,19 +290,19 @@ def test_native_autoreset_updates_the_copy_of_the_reset_env_only():
     torch.testing.assert_close(after[1], before[1] + 7)
 
 
-def networks():
+def rnd_networks():
     return nn.Linear(OBSERVATION_DIM, 2), nn.Linear(OBSERVATION_DIM, 2)
 
 
 @pytest.mark.parametrize("first", [True, False])
 def test_two_rewards_under_one_key_are_refused_in_either_order(first):
-    ours, theirs = IntrinsicReward(fixed_encoder()), RNDTransform(*networks())
+    ours, theirs = IntrinsicReward(fixed_encoder()), RNDTransform(*rnd_networks())
     pair = (ours, theirs) if first else (theirs, ours)
     with pytest.raises(ValueError, match=r"'intrinsic_reward'.*out_key"):
         TransformedEnv(PointEnv(), Compose(DirectionPrimer(K), *pair)).reset()
     other = IntrinsicReward(fixed_encoder(), out_key="bonus")
     TransformedEnv(
-        PointEnv(), Compose(DirectionPrimer(K), other, RNDTransform(*networks()))
+        PointEnv(), Compose(DirectionPrimer(K), other, RNDTransform(*rnd_networks()))
     ).reset()
 
 

@@ -1,4 +1,4 @@
-"""LatentAction: the check list, in processes too, with modules and specs of any kind."""
+"""LatentAction: the checks of a latent action, with any kind of module and spec."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ SPEC = Bounded(-1, 1, shape=(D,))
 
 
 def fixed_module(key="action"):
-    """The network of the decoder that the checks of values know, without its attributes."""
+    """The network of :func:`fixed_decoder`, without the attributes of a decoder."""
     return TensorDictModule(fixed_decoder().module, ["z"], [key])
 
 
@@ -44,8 +44,8 @@ class TestLatentAction(LatentActionChecks):
         return TransformedEnv(PointEnv(), SynergyAction(fixed_decoder(), synergy_key="latent"))
 
 
-def shifting(size, shape=()):
-    """``size`` moves to choose from, by their number."""
+def categorical_module(size, shape=()):
+    """An embedding of ``size`` actions and the spec of their indices."""
     moves = nn.Embedding(size, ACTION_DIM)
     torch.nn.init.uniform_(moves.weight, -1, 1)
     return TensorDictModule(moves, ["z"], ["action"]), Categorical(size, shape=shape)
@@ -53,7 +53,7 @@ def shifting(size, shape=()):
 
 @pytest.mark.parametrize("batch_size", [(), (3,)])
 def test_categorical_latent_selects_a_row_of_the_embedding(batch_size):
-    module, spec = shifting(4)
+    module, spec = categorical_module(4)
     env = TransformedEnv(PointEnv(batch_size), LatentAction(module, spec))
     check_env_specs(env)
     rollout = env.rollout(3)
@@ -63,7 +63,7 @@ def test_categorical_latent_selects_a_row_of_the_embedding(batch_size):
 
 
 def push(latent):
-    """One of CartPole's two actions, a number without a size of its own."""
+    """One of CartPole's two actions, as a scalar."""
     return (latent.sum(-1) > 0).long()
 
 
@@ -71,16 +71,16 @@ def cart_pole():
     return GymEnv("CartPole-v1", categorical_action_encoding=True)
 
 
-def of_pushes(env):
+def with_push(env):
     return TransformedEnv(env, LatentAction(TensorDictModule(push, ["z"], ["action"]), SPEC))
 
 
 @pytest.mark.parametrize(
     ("make", "batch_size"),
     [
-        (lambda: of_pushes(cart_pole()), ()),
-        (lambda: of_pushes(SerialEnv(2, cart_pole)), (2,)),
-        (lambda: SerialEnv(2, lambda: of_pushes(cart_pole())), (2,)),
+        (lambda: with_push(cart_pole()), ()),
+        (lambda: with_push(SerialEnv(2, cart_pole)), (2,)),
+        (lambda: SerialEnv(2, lambda: with_push(cart_pole())), (2,)),
     ],
 )
 def test_scalar_action_is_decoded_for_every_row(make, batch_size):

@@ -1,4 +1,4 @@
-"""Directions of sampled transitions, drawn anew."""
+"""RedrawDirection: sampled transitions relabelled with new directions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def transitions(*size, key="direction"):
     return ends[0].set("next", ends[1])
 
 
-def spread(directions):
+def count_distinct(directions):
+    """The number of distinct directions, which must be unit vectors."""
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(directions.shape[:-1]))
     return len({tuple(row) for row in directions.reshape(-1, K).tolist()})
 
@@ -34,7 +35,7 @@ def spread(directions):
 @pytest.mark.parametrize("size", [(), (40,), (4, 10)])
 def test_both_ends_get_the_same_new_unit_vector(size):
     batch = RedrawDirection(DirectionPrimer(K))(transitions(*size))
-    assert spread(batch["direction"]) == max(1, torch.Size(size).numel())
+    assert count_distinct(batch["direction"]) == max(1, torch.Size(size).numel())
     assert torch.equal(batch["direction"], batch["next", "direction"])
     assert not torch.equal(batch["direction"], transitions(*size)["direction"])
 
@@ -58,7 +59,7 @@ def test_keys_may_be_nested():
     key = ("agent", "direction")
     redraw = RedrawDirection(DirectionPrimer(K, out_key=key))
     batch = redraw(transitions(20, key=key))
-    assert spread(batch[key]) == 20
+    assert count_distinct(batch[key]) == 20
     assert torch.equal(batch[key], batch["next", "agent", "direction"])
 
 
@@ -71,7 +72,7 @@ def test_buffer_keeps_followed_directions_and_bonus_uses_new_ones():
     buffer.extend(stored)
     for _ in range(2):
         batch = buffer.sample()
-        assert spread(batch["direction"]) == 30
+        assert count_distinct(batch["direction"]) == 30
         moved = encoder.module(batch["next", "observation"]) - encoder.module(batch["observation"])
         expected = (moved * batch["direction"]).sum(-1, keepdim=True)
         torch.testing.assert_close(batch["next", "intrinsic_reward"], expected)
@@ -81,7 +82,7 @@ def test_buffer_keeps_followed_directions_and_bonus_uses_new_ones():
 def test_works_in_nn_sequential_and_can_be_cloned():
     redraw = RedrawDirection(DirectionPrimer(K), share=0.5)
     model = nn.Sequential(redraw, redraw.clone())
-    assert spread(model(transitions(30))["direction"]) > 10
+    assert count_distinct(model(transitions(30))["direction"]) > 10
     assert redraw.clone().share == 0.5
     redraw.load_state_dict(RedrawDirection(DirectionPrimer(K)).state_dict())
 

@@ -1,4 +1,4 @@
-"""RNDBonus: the check list of a transform, its numbers, whose statistics it keeps."""
+"""RNDBonus: the checks of a transform, its values, and observation statistics."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def fixed_loss(**kwargs) -> RNDLoss:
     return RNDLoss(*networks, **kwargs)
 
 
-def multiples(predictor: float = 3.0, target: float = 1.0, **kwargs) -> RNDLoss:
-    """One feature of one number: 3 o predicts o."""
+def linear_loss(predictor: float = 3.0, target: float = 1.0, **kwargs) -> RNDLoss:
+    """One feature of a scalar observation o: the predictor gives 3 o, the target o."""
     networks = [nn.Linear(1, 1, bias=False) for _ in range(2)]
     for network, factor in zip(networks, (predictor, target), strict=True):
         nn.init.constant_(network.weight, factor)
@@ -68,27 +68,27 @@ class TestRNDBonus(TransformChecks):
         first, second = (RNDBonus(fixed_loss(), decay=0.9) for _ in range(2))
         first(PointEnv().rollout(4))
         own = {f"deviation.{name}" for name in ("mean", "variance", "weight")}
-        assert set(first.state_dict()) == own, "networks and their statistics are the loss's"
+        assert set(first.state_dict()) == own, "networks and their statistics belong to the loss"
         second.load_state_dict(first.state_dict())
         assert torch.equal(first.deviation.variance, second.deviation.variance)
 
     def test_no_env(self):
-        data = RNDBonus(multiples(), normalize=False)(transitions([1.0, -3.0]))
+        data = RNDBonus(linear_loss(), normalize=False)(transitions([1.0, -3.0]))
         assert data[KEY].tolist() == [[4.0], [36.0]]  # (3 o - o)²
 
     def test_compose(self):
         doubled = RewardScaling(0.0, 2.0, in_keys=[KEY])
-        data = Compose(RNDBonus(multiples(), normalize=False), doubled)(transitions([1.0]))
+        data = Compose(RNDBonus(linear_loss(), normalize=False), doubled)(transitions([1.0]))
         assert data[KEY].tolist() == [[8.0]]
 
     def test_model(self):
         network = TensorDictModule(nn.Linear(1, 2), in_keys=[KEY], out_keys=["out"])
         for model in (nn.Sequential, TensorDictSequential):
-            found = model(RNDBonus(multiples()), network)(transitions([1.0, 2.0]))
+            found = model(RNDBonus(linear_loss()), network)(transitions([1.0, 2.0]))
             assert found["out"].shape == (2, 2)
 
     def test_replay_buffer(self):
-        loss = multiples()
+        loss = linear_loss()
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), batch_size=8)
         buffer.append_transform(RNDBonus(loss, normalize=False))
         buffer.extend(transitions([1.0, 3.0]))
@@ -103,7 +103,7 @@ class TestRNDBonus(TransformChecks):
 
 
 def test_error_is_of_standardized_and_clipped_observations():
-    loss = multiples(obs_rms=statistics(mean=1.0, var=4.0), obs_clip=3.0)
+    loss = linear_loss(obs_rms=statistics(mean=1.0, var=4.0), obs_clip=3.0)
     bonus = RNDBonus(loss, normalize=False, update_statistics=False)
     # (5 - 1) / 2 = 2 and (-99 - 1) / 2, clipped to -3: (2 o)² = 16 and 36.
     assert bonus(transitions([5.0, -99.0]))[KEY].flatten().tolist() == [16.0, 36.0]
@@ -124,8 +124,8 @@ def test_bonus_equals_torchrls_transform_with_the_same_statistics():
 
 @pytest.mark.parametrize("update", [True, False])
 def test_observation_statistics_update_in_eval_mode_unless_disabled(update):
-    """Of 1 and 3: mean 2 and variance 1, but for the ten-thousandth observation of the start."""
-    loss = multiples(obs_rms=RunningMeanStd((1,)))
+    """Of 1 and 3: mean 2 and variance 1, up to the initial count of 1e-4."""
+    loss = linear_loss(obs_rms=RunningMeanStd((1,)))
     bonus = RNDBonus(loss, update_statistics=update).eval()
     bonus(transitions([1.0, 3.0]))
     mean, var = (2.0, 1.0) if update else (0.0, 1.0)
@@ -134,7 +134,7 @@ def test_observation_statistics_update_in_eval_mode_unless_disabled(update):
 
 
 def test_predictor_is_held_by_reference_and_bonus_has_no_gradient():
-    loss = multiples()
+    loss = linear_loss()
     bonus = RNDBonus(loss)
     assert not list(bonus.parameters())
     assert not bonus(transitions([1.0]))[KEY].requires_grad

@@ -1,4 +1,4 @@
-"""What a bonus and the task's reward are divided by, in IntrinsicReward."""
+"""IntrinsicReward: the running scales of the bonus and of the task reward."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ def test_extrinsic_weight_adds_the_task_reward(weight, expected):
 def test_bonus_and_task_reward_are_scaled_separately():
     data = transitions([0.0, 0.0], [1.0, -1.0], [1.0, 1.0], rewards=[10.0, 16.0])
     IntrinsicReward(doubler(), extrinsic_weight=0.5)(data)
-    # Bonuses 2 and -2 have a deviation of 2, rewards one of 3.
+    # Bonuses 2 and -2 have a standard deviation of 2, rewards 10 and 16 of 3.
     expected = torch.tensor([1 + 0.5 * 10 / 3, -1 + 0.5 * 16 / 3])
     torch.testing.assert_close(data["next", "intrinsic_reward"].flatten(), expected)
 
@@ -30,7 +30,7 @@ def test_scaling_keeps_the_sign_and_gives_unit_deviation():
     data = transitions([0.0] * 4_000, ends.tolist(), [1.0] * 4_000)
     bonus = IntrinsicReward(doubler())(data)["next", "intrinsic_reward"].flatten()
     assert abs(bonus.std(correction=0) - 1) < 1e-5
-    # Were the mean subtracted, it would be 0 and small positive bonuses would turn negative.
+    # The mean is not subtracted, so small positive bonuses stay positive.
     torch.testing.assert_close(bonus.mean(), ends.mean() / ends.std(correction=0))
     assert torch.equal(bonus.sign(), ends.sign())
 

@@ -1,4 +1,4 @@
-"""SynergyAction: the check list, whose weights act, what it refuses."""
+"""SynergyAction: the checks of a latent action, weights in use, and refused decoders."""
 
 import re
 
@@ -27,7 +27,7 @@ class TestSynergyAction(LatentActionChecks):
             )
         return SynergyAction(fixed_decoder())
 
-    # Collectors in other processes start slowly; those of LatentAction run it too.
+    # Worker processes start slowly; those of TestLatentAction include SynergyAction.
     test_two_collector_workers_collect = None
 
 
@@ -50,7 +50,7 @@ class TestSynergyActionUnderTheActionKey(LatentActionChecks):
     def test_action_spec_is_one_leaf(self):
         assert self.env().action_spec == fixed_decoder().synergy_spec
 
-    # They start slowly and would tell nothing beyond those of LatentAction.
+    # Worker processes start slowly; those of TestLatentAction suffice.
     test_two_collector_workers_collect = None
 
 

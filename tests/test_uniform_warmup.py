@@ -1,4 +1,4 @@
-"""Uniform actions at the beginning: as many as asked for, within bounds, across a resume."""
+"""Uniform warm-up: the number of random actions, their range, and resuming."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_negative_number_of_frames_is_refused():
 
 def test_stage_starts_with_uniform_synergies_then_uses_its_policy():
     stage = learn_stage(None, "learn.init_random_frames=64")
-    with torch.no_grad():  # a policy that emits the upper bound
+    with torch.no_grad():  # a policy at the upper bound
         for parameter in stage.learner.actor.parameters():
             parameter.zero_()
         head = [m for m in stage.learner.actor.modules() if isinstance(m, torch.nn.Linear)][-1]

@@ -1,4 +1,4 @@
-"""Moving pictures of a policy: what is in them, when they were taken, and what prevents them."""
+"""Videos of a policy: their content, timing and files, and refused settings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELBOW = "myoElbowPose1D6MRandom-v0"
 
 
 class Blind:
-    """MuJoCo's renderer without GL: what would be drawn is in its scene; a picture is its size."""
+    """MuJoCo's renderer without GL: fills its scene and returns black frames."""
 
     def __init__(self, model: mujoco.MjModel, height: int, width: int) -> None:
         self.model, self.scene = model, mujoco.MjvScene(model, 2000)
@@ -56,7 +56,7 @@ def recorder(env, monkeypatch):
 
 @pytest.fixture(scope="module")
 def flexing(env):
-    """A policy that pulls at all muscles."""
+    """A policy that excites all muscles fully."""
 
     def pull(observation):
         return observation.new_ones((*observation.shape[:-1], env.action_spec.shape[-1]))
@@ -75,7 +75,7 @@ def test_tendons_are_colored_by_muscle_activation(recorder, env, flexing):
     assert {geom.objid for geom in drawn} >= pulled.keys()
     for geom in drawn:
         np.testing.assert_allclose(geom.rgba[:3], expected[pulled[geom.objid]], atol=1e-6)
-    assert (np.subtract(*expected.T[[0, 2]]) > 0.3).all(), "red, after 0.3 s of full excitation"
+    assert (np.subtract(*expected.T[[0, 2]]) > 0.3).all(), "red after 0.3 s of full excitation"
 
 
 def test_recording_has_25_frames_per_second_with_first_and_last(recorder, env, flexing):
@@ -119,7 +119,7 @@ def test_azimuth_sets_the_view_direction(env, monkeypatch):
 
 
 def test_framing_covers_only_the_visible_geoms_of_the_body():
-    # A body whose box stands on its origin, a large sphere of it that is not drawn, and a floor.
+    # A body with a box above its origin and a large hidden sphere, and a floor.
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="3 0 0"><freejoint/>
         <geom type="box" pos="0 0 .5" size=".25 .1 .5"/><geom type="sphere" size="5" group="3"/>
@@ -127,7 +127,12 @@ def test_framing_covers_only_the_visible_geoms_of_the_body():
     )
     data = mujoco.MjData(model)
     turned = np.deg2rad(90) / 2
-    data.qpos[3:] = [np.cos(turned), 0, np.sin(turned), 0]  # about y: what was up is along x
+    data.qpos[3:] = [
+        np.cos(turned),
+        0,
+        np.sin(turned),
+        0,
+    ]  # about y, so that the box points along x
     mujoco.mj_forward(model, data)
     middle, size = middle_and_size(model, data)
     np.testing.assert_allclose(middle, [3.5, 0.0, 0.0], atol=1e-6)
@@ -171,7 +176,7 @@ def test_video_and_animation_are_written_without_leftovers(tmp_path):
     assert sorted(path.name for path in video.parent.iterdir()) == [picture.name, video.name][::-1]
     with Image.open(picture) as image:
         assert image.size == (2 * 2 * 32, 24 + 16)
-        assert image.n_frames == 5 and image.info["loop"] == 0  # every second; for ever
+        assert image.n_frames == 5 and image.info["loop"] == 0  # every second frame; loops forever
     import imageio.v2 as imageio
 
     decoded = imageio.mimread(video)

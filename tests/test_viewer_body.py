@@ -1,4 +1,4 @@
-"""What the page draws of a body and how much of it the camera takes in, without a browser."""
+"""The viewer without a browser: drawn parts of a body, and the view of the camera."""
 
 from __future__ import annotations
 
@@ -66,4 +66,4 @@ def test_camera_frames_a_tendon_beyond_the_body(server):
         ray = end - camera.position
         aside = np.arccos(ray @ view / np.linalg.norm(ray) / np.linalg.norm(view))
         assert aside < camera.fov / 2
-    assert np.linalg.norm(view) < 4 * 2  # and it is no dot in the distance
+    assert np.linalg.norm(view) < 4 * 2  # and not too far away

@@ -1,7 +1,7 @@
-"""The viewer's page in a real browser: it loads, a slider moves a muscle, play advances time.
+"""The viewer's page in a browser: loading, sliders, play and pause.
 
 Needs Chromium (Debian: ``apt-get install chromium``) and Playwright for Python (``pip install
-playwright``); no browser of Playwright's own is downloaded.
+playwright``); Playwright downloads no browser.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def page() -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def browser(page) -> Iterator[tuple]:
-    """The page in Chromium, and what went wrong in its console."""
+    """The page in Chromium, and the errors of its console."""
     faults: list[str] = []
     with playwright.sync_playwright() as engines:
         chromium = engines.chromium.launch(
@@ -81,7 +81,7 @@ def wait(until: Callable[[], bool]) -> bool:
 
 
 def press(tab, name: str, until: Callable[[], bool]) -> bool:
-    """Click, and once more if nothing came of it, as a person would: viser 1.1 has lost a click."""
+    """Click, and once more if nothing happens: viser 1.1 can lose a click."""
     for _ in range(2):
         tab.get_by_role("button", name=name).dispatch_event("click")
         if wait(until):

@@ -1,4 +1,4 @@
-"""The viewer's page without a browser: what its buttons ask for, and what becomes of it."""
+"""The viewer's page without a browser: its controls and their effects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SMALL = "cartpole-balance"
 
 
 def open_page(name: str, **parts) -> Page:
-    """A page of a task whose one synergy moves all actuators, on a port that is free."""
+    """A page of a task on a free port, with one synergy that moves all actuators."""
     spec = EnvironmentSpec.of(make_env(name))
     low, high = spec.low, spec.high
     decoder = SynergyDecoder.from_directions(
@@ -31,15 +31,15 @@ def open_page(name: str, **parts) -> Page:
     return Page(Session(replace(subject, **parts)), port=0)
 
 
-def by_a_person(page: Page, label: str, value: object = None) -> None:
-    """What viser does when a person in a browser uses the control with this label."""
+def use_control(page: Page, label: str, value: object = None) -> None:
+    """Use the control with this label as viser does for a browser."""
     handles = page.server.gui._gui_input_handle_from_uuid.values()
     handle = next(handle for handle in handles if handle.label == label)
     if value is not None:
         handle.value = value
     for callback in handle._impl.update_cb:
         callback(SimpleNamespace(client=object(), target=handle))
-    page._shown_at = page._refreshed_at = 0.0  # so that what follows is shown at once
+    page._shown_at = page._refreshed_at = 0.0  # so that this tick updates everything
     page.tick(0.1)
 
 
@@ -50,7 +50,7 @@ def test_slider_moves_and_recolors_the_drawn_body(name):
     try:
         placed, shapes = page.body._placed.copy(), page.body._shapes
         shades = {key: shape.batched_colors.copy() for key, shape in shapes.items()}
-        by_a_person(page, "1", 1.0)
+        use_control(page, "1", 1.0)
         assert page.session.steps > 0 and page.session.coefficients.tolist() == [1.0]
         assert page.body._parts and np.isfinite(placed).all()
         assert (page.body._placed != placed).any()
@@ -69,7 +69,7 @@ def test_joints_are_drawn_at_a_followed_body():
         mujoco.mj_forward(page.session.model, data)
         body.draw()
         np.testing.assert_allclose(body._world.position[:2], -data.body("torso").xpos[:2])
-        # The browser moves the world a picture before it moves the joints.
+        # The browser moves the world one frame before it moves the joints.
         assert not joints.name.startswith("/world")
         np.testing.assert_allclose(joints.batched_positions, before, atol=1e-5)
     finally:
@@ -83,10 +83,10 @@ def test_every_click_draws_another_direction():
     try:
         drawn = []
         for _ in range(2):
-            by_a_person(page, "Draw a direction")
+            use_control(page, "Draw a direction")
             drawn.append(page.session.direction)
         assert not torch.equal(*drawn)
-        by_a_person(page, "Direction", "−2")
+        use_control(page, "Direction", "−2")
         assert page.session.direction.tolist() == [0.0, -1.0, 0.0]
     finally:
         page.close()
@@ -101,10 +101,10 @@ def test_failed_goal_shows_its_error_and_restores_the_menu():
     both = replace(resolve_task(SMALL), random_id="another")
     page = open_page(SMALL, task=both, make_env=make)
     try:
-        by_a_person(page, "Goal", "random")
+        use_control(page, "Goal", "random")
         assert "no such simulator" in page._controls["message"].content
         assert page._controls["goal"].value == "fixed"
-        by_a_person(page, "Step")
+        use_control(page, "Step")
         assert page.session.steps == 1
     finally:
         page.close()

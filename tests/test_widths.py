@@ -1,4 +1,4 @@
-"""A last size of 1 is refused where PyTorch would repeat it."""
+"""A wrong last dimension is refused, also a size of 1 that PyTorch would broadcast."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundles and policies for code that knows Gymnasium and NumPy only."""
+"""Bundles and policies for code with Gymnasium and NumPy alone."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_wrapper_equals_the_transform(residual):
     transformed.set_seed(3)
     state = transformed.reset()
     wrapped.reset(seed=3)
-    observation, _ = wrapped.reset()  # TorchRL resets to seed, and then anew
+    observation, _ = wrapped.reset()  # TorchRL resets once to seed, then again
     np.testing.assert_array_equal(observation, state["observation"])
     for _ in range(5):
         synergy = transformed.full_action_spec["synergy"].rand()
@@ -58,7 +58,7 @@ def test_wrapper_equals_the_transform(residual):
 
 
 class DoublePrecision(gymnasium.Env):
-    """Bounds that single precision rounds outwards; refuses actions beyond."""
+    """An env that refuses actions beyond its bounds, which single precision rounds outwards."""
 
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
     action_space = gymnasium.spaces.Box(-0.3, 0.3, (5,), np.float64)
@@ -146,7 +146,7 @@ def test_a_policy_function_is_the_policy_without_noise():
 
 
 def blocks() -> tuple[str, str, str]:
-    """What the page does with a policy, with synergies, and with Stable-Baselines3."""
+    """The page's code for a policy, for synergies, and for Stable-Baselines3."""
     policy, synergies, agent = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
     assert "stable_baselines3" in agent
     return policy, synergies, agent

@@ -1,4 +1,4 @@
-"""Entries of the zoo: out of runs, whole or refused, and back as policies that do the same."""
+"""Zoo entries: exported from runs, refused if damaged, and loaded as the same policies."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def exported(run):
-    """An entry of it."""
+    """A zoo entry exported from the run."""
     export_run(run, run.parent / "toy", composed, CONF, episodes=3)
     return run.parent / "toy"
 
@@ -55,7 +55,7 @@ def test_saved_config_of_another_kind_is_read_unchanged(kind, tmp_path):
 
 @pytest.fixture
 def entry(exported, tmp_path):
-    """The same, to be damaged."""
+    """A copy of the entry, to be damaged."""
     return shutil.copytree(exported, tmp_path / "toy")
 
 
@@ -198,11 +198,11 @@ def test_card_command_gives_the_same_config(overrides):
     told = shlex.split(command_of(made, composed, CONF, "toy"))
     assert told[:2] == ["python", "recipes/etl_sac.py"]
     again = composed(translate(told[2:], CONF))
-    assert place_aside(again) == place_aside(made)
+    assert without_output_settings(again) == without_output_settings(made)
 
 
-def place_aside(config) -> dict:
-    """What makes a run what it is, wherever it is."""
+def without_output_settings(config) -> dict:
+    """The configuration without run_dir, logs, pictures and threads."""
     plain = OmegaConf.to_container(config)
     for key in (
         "run_dir",
@@ -241,7 +241,7 @@ def test_card_command_of_a_run_without_stage_1_gives_the_same_config(choice, exp
     made = Experiment(tiny("run_dir=unused", choice.format(exported))).config
     told = shlex.split(command_of(made, composed, CONF, exported))
     again = Experiment(composed(translate([*told[2:], "run_dir=unused"], CONF))).config
-    assert place_aside(again) == place_aside(made)
+    assert without_output_settings(again) == without_output_settings(made)
 
 
 def rewrite(entry, **changes):
