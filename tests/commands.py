@@ -1,4 +1,4 @@
-"""A script in this process: what a person types, without the seconds that imports take."""
+"""Recipes and scripts as commands: in this process, where imports are done, or in another."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.configs import ROOT
 
 
 def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProcess:
-    """Run ``recipes/RECIPE`` in a process and a folder of its own."""
+    """Run ``recipes/RECIPE`` in another process, in the folder ``cwd``, until it ends."""
     return subprocess.run(
         [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
         capture_output=True,
@@ -32,7 +32,7 @@ def process(recipe: str, *overrides: str, cwd: Path) -> subprocess.CompletedProc
 
 
 def begun(recipe: str, *overrides: str, cwd: Path) -> subprocess.Popen:
-    """The same process while it runs, whose output holds its errors too."""
+    """Start ``recipes/RECIPE`` in another process; its output includes stderr."""
     return subprocess.Popen(
         [sys.executable, str(ROOT / "recipes" / recipe), *overrides],
         stdout=subprocess.PIPE,
@@ -46,7 +46,7 @@ def begun(recipe: str, *overrides: str, cwd: Path) -> subprocess.Popen:
 def wait_until(
     condition: Callable[[], object], process: subprocess.Popen, seconds: float = 200
 ) -> None:
-    """Wait for what a process brings about while it runs."""
+    """Wait for a condition that a running process brings about; fail if the process ends first."""
     deadline = time.monotonic() + seconds
     while not condition():
         if process.poll() is not None:
@@ -64,12 +64,12 @@ def command(recipe: str, *arguments: str) -> int:
 def script(path: Path, *arguments: str) -> int:
     """Run a script with arguments as its command line; returns its exit code.
 
-    ``sys.exit`` with a text prints it, as the interpreter does.
+    A text in ``sys.exit`` is printed to stderr, as the interpreter does.
     """
     with MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [str(path), *arguments])
         patch.setattr(sys, "path", [str(path.parent), *sys.path])
-        # Hydra sets logging up anew, on which absl closes the stream it wrote to: pytest's.
+        # Hydra reconfigures logging, whereupon absl closes its stream, which is pytest's.
         patch.setattr(logging, "shutdown", lambda *handlers: None)
         try:
             runpy.run_path(str(path), run_name="__main__")
@@ -82,7 +82,7 @@ def script(path: Path, *arguments: str) -> int:
 
 
 def recipe_module(name: str) -> ModuleType:
-    """``recipes/NAME.py`` as a module, for what it says without being run."""
+    """``recipes/NAME.py`` imported as a module, for tests of its functions."""
     spec = importlib.util.spec_from_file_location(f"{name}_recipe", ROOT / "recipes" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

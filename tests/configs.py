@@ -18,7 +18,7 @@ from torchrl_etl.training.resumed import parse_override
 ROOT = Path(__file__).parent.parent
 CONF = ROOT / "recipes" / "conf"
 
-# Small nets on the analytic environment: a stage takes a second or two.
+# Small networks on the analytic environment: a stage takes a second or two.
 TINY = (
     "env=overactuated",
     "experiment=smoke",
@@ -40,7 +40,7 @@ TINY = (
 )
 
 ELBOW = "env=myoElbowPose1D6MFixed-v0"
-# The frames that a method takes before it learns, and what it learns besides.
+# A short preparation, and small extra networks, of each method.
 BRIEFLY = {
     "dep": ["method.options.dep_frames=64", "method.options.tau=4"],
     "dynsyn": ["method.options.frames=200"],
@@ -52,7 +52,7 @@ BRIEFLY = {
     "eme": ["method.options.hidden=[16]"],
 }
 
-# What learner=plain takes away, given back to it.
+# The options that learner=plain turns off.
 RESIDUAL = (
     "actor.body=residual",
     "critic.body=residual",
@@ -64,7 +64,7 @@ RESIDUAL = (
 
 
 def tiny(*overrides: str, name: str = "config") -> DictConfig:
-    """The tiny configuration with overrides, of those settings that the chosen kinds have."""
+    """The tiny configuration with overrides; settings that the chosen kinds lack are left out."""
     small = [setting for setting in TINY if _is_there(setting, overrides)]
     given = [parse_override(override) for override in translate(overrides, CONF)]
     kinds = [override for override in given if not _is_value(override)]
@@ -76,19 +76,19 @@ def tiny(*overrides: str, name: str = "config") -> DictConfig:
 
 
 def composed(overrides: Sequence[str] = ()) -> DictConfig:
-    """What a recipe makes of Hydra's overrides."""
+    """The configuration that a recipe composes from Hydra's overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=list(overrides))
 
 
 def rival(method: str, run: Path, *overrides: str) -> DictConfig:
-    """A method's tiny configuration on the elbow, its preparation short too, in folder `run`."""
+    """A tiny configuration of a method on the elbow, with a short preparation, in folder `run`."""
     brief = BRIEFLY.get(method, [])
     return tiny(ELBOW, f"method={method}", "frames=608", f"run_dir='{run}'", *brief, *overrides)
 
 
 def _is_value(override: Override) -> bool:
-    """Whether an override gives a setting that is there another value, and chooses no file."""
+    """Whether an override changes the value of a setting, rather than choosing a file."""
     plain = override.type is OverrideType.CHANGE
     return plain and not (CONF / override.key_or_group).is_dir()
 
@@ -103,7 +103,7 @@ def _is_there(setting: str, overrides: Sequence[str]) -> bool:
     section, _, key = setting.partition("=")[0].partition(".")
     given = {name: value for name, _, value in (o.partition("=") for o in overrides)}
     kind = given.get(section)
-    if kind is None and (method := given.get("method")):  # which may bring one
+    if kind is None and (method := given.get("method")):  # a method may choose a kind
         for default in OmegaConf.load(group_files(CONF, "method")[method]).get("defaults", ()):
             kind = default.get(f"override /{section}", kind)
     if not key or (file := group_files(CONF, section).get(kind)) is None:

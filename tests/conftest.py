@@ -1,4 +1,4 @@
-"""What makes hundreds of tiny runs in one process quick, and each draw what it always draws."""
+"""Fixtures of all tests: speed for hundreds of tiny runs in one process, and fixed seeds."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pytest
 
 
 def pytest_collection_finish() -> None:
-    """Let the garbage collector pass over what was imported, which lives as long as the tests."""
+    """Exclude imported objects, which live as long as the tests, from garbage collection."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_the_disk() -> None:
-    """No test cuts the power, and a checkpoint waits for the disk at every file."""
+    """Turn off fsync, which every file of a checkpoint waits for: no test needs it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
         yield
@@ -26,15 +26,15 @@ def no_waiting_for_the_disk() -> None:
 
 @pytest.fixture(autouse=True)
 def same_numbers() -> None:
-    """What a test draws by PyTorch's generator does not depend on the tests before it."""
-    if "torch" in sys.modules:  # not imported here: a test without it need not wait for it
+    """Seed PyTorch before every test, so that its draws do not depend on earlier tests."""
+    if "torch" in sys.modules:  # not imported here: some tests do without it
         sys.modules["torch"].manual_seed(0)
 
 
 @pytest.fixture
 def traced_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compiled functions run the graph that was traced as it is; one that cannot be fails."""
-    # Not at the top: the process that only hands tests out loads this file too.
+    """Compiled functions run the traced graph without lowering it; a failed trace fails."""
+    # Imported here because the process that distributes tests loads this file too.
     from torchrl_etl.learners import compiled
 
     monkeypatch.setattr(compiled._inductor, "compile", lambda graph, inputs: graph)

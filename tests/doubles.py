@@ -1,4 +1,4 @@
-"""Seeded inputs in double precision, and gradients against finite differences."""
+"""Seeded inputs in double precision, and gradient checks by finite differences."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def positive(*shape: int, seed: int = 0) -> Tensor:
 
 
 def gradients_match(function: Callable[..., Tensor], *shapes: tuple[int, ...]) -> bool:
-    """Whether the gradients of a function of such inputs are those of finite differences."""
+    """Whether gradients of a function of inputs of these shapes equal finite differences."""
     inputs = [doubles(*shape, seed=i, grad=True) for i, shape in enumerate(shapes)]
     return gradcheck(function, inputs)

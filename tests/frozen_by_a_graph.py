@@ -1,4 +1,4 @@
-"""Policies of which a traced graph would miss something: 16 actions of 6 observations."""
+"""Policies that a traced graph would not reproduce: 6 observations, 16 actions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ act = partial(TensorDictModule, in_keys=["observation"], out_keys=["action"])
 
 
 class Odd(nn.Linear):
-    """Has a number, a count and a branch in Python, and a second method."""
+    """A layer with a number, a call count and a branch in Python, and a second method."""
 
     def __init__(self) -> None:
         super().__init__(6, 16)

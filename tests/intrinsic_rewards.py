@@ -1,4 +1,4 @@
-"""Encoders and transitions whose intrinsic rewards are known beforehand."""
+"""Encoders and transitions with known intrinsic rewards."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ K = 2
 
 
 def fixed_encoder(embedding_dim=K):
-    """The same weights in every process."""
+    """An encoder with the same weights in every process."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         return StateEncoder(OBSERVATION_DIM, embedding_dim, hidden=(8,))
@@ -28,7 +28,7 @@ def doubler(size=1):
 
 
 def transitions(starts, ends, directions, rewards=None):
-    """One-dimensional observations and directions."""
+    """Transitions with one-dimensional observations and directions."""
     as_column = partial(torch.tensor, dtype=torch.float32)
     data = TensorDict(
         {

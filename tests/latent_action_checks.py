@@ -1,4 +1,4 @@
-"""What every LatentAction must pass, and a decoder for it whose weights are known."""
+"""Checks that every LatentAction must pass, and a decoder with fixed weights."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ D = 2
 
 
 def fixed_decoder(action_dim=ACTION_DIM, **kwargs):
-    """The same weights in every process."""
+    """A decoder with the same weights in every process."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         return SynergyDecoder(D, action_dim, hidden=(8,), **kwargs)
@@ -31,7 +31,7 @@ def decode(synergy, decoder=None):
 
 
 class LatentActionChecks(TransformChecks):
-    """The check list with the values of :func:`fixed_decoder`; subclasses name the keys too."""
+    """Checks of a transform with the values of :func:`fixed_decoder`; subclasses name the keys."""
 
     latent_key: str
     decoded_key = "action"
@@ -41,7 +41,7 @@ class LatentActionChecks(TransformChecks):
         torch.testing.assert_close(executed, decode(rollout[self.latent_key]))
         expected = move(rollout["observation"], executed)
         torch.testing.assert_close(rollout["next", "observation"], expected)
-        # Root holds what was executed before, and zero at the start of each episode.
+        # The root holds the previous executed action, and zero at the start of an episode.
         before = executed[..., :-1, :].where(~rollout["next", "done"][..., :-1, :], 0.0)
         torch.testing.assert_close(rollout["executed_action"][..., 1:, :], before)
         assert (executed.norm(dim=-1) > 0.1).all()
@@ -101,7 +101,7 @@ class LatentActionChecks(TransformChecks):
             ReplayBuffer(storage=storage(), transform=self.transform())
         with refused():
             TensorDictReplayBuffer(storage=storage(), transform=Compose(self.transform()))
-        # TorchRL calls a factory at the buffer's first use.
+        # TorchRL calls a transform factory at the first use of the buffer.
         buffer = TensorDictReplayBuffer(storage=storage(), transform_factory=self.transform)
         with refused():
             buffer.extend(TensorDict({self.latent_key: torch.zeros(4, D)}, [4]))

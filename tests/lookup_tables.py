@@ -1,4 +1,4 @@
-"""Networks that are lookup tables, and transitions between their rows: numbers by hand."""
+"""Lookup tables as networks, and transitions between their rows, for losses by hand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 class Lookup(nn.Module):
-    """Observation i, one-hot, gives row i."""
+    """Maps the one-hot observation i to row i."""
 
     def __init__(self, rows: list[list[float]]) -> None:
         super().__init__()
@@ -20,12 +20,12 @@ class Lookup(nn.Module):
 
 
 def table(*rows: list[float]) -> TensorDictModule:
-    """Embeddings of as many states."""
+    """An encoder that maps state i to row i."""
     return TensorDictModule(Lookup(list(rows)), in_keys=["observation"], out_keys=["embedding"])
 
 
 def steps(states: list[int], following: list[int], num: int, **entries: Tensor) -> TensorDict:
-    """Steps from states to others of ``num``, with more entries at the root."""
+    """Steps between ``num`` one-hot states, with further entries at the root."""
     one_hot, size = torch.eye(num), [len(states)]
     following = TensorDict({"observation": one_hot[following]}, size)
     return TensorDict({"observation": one_hot[states], "next": following, **entries}, size)
@@ -34,7 +34,7 @@ def steps(states: list[int], following: list[int], num: int, **entries: Tensor) 
 def transitions(
     states: list[int], following: list[int], rewards: list[float], ended: list[bool], num: int
 ) -> TensorDict:
-    """Steps with the task's rewards and ends, and an action that means nothing."""
+    """Steps with rewards, terminations, and an action of zero."""
     data = steps(states, following, num, action=torch.zeros(len(states), 1))
     data["next", "reward"] = torch.tensor(rewards).unsqueeze(-1)
     data["next", "terminated"] = torch.tensor(ended).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""What every loss of this library must pass: TorchRL's habits for losses, written once.
+"""Checks that every loss of this library must pass: TorchRL's conventions for losses.
 
 Subclass :class:`LossChecks` in a test file, say how to build the loss and a batch for it, and
 pytest runs the whole list on it.
@@ -271,7 +271,7 @@ class LossChecks(ABC):
             return sum(out.values()), out
 
         weights = {key: stacked.pop(key) for key in trained}
-        # Every seed draws the same numbers, those of a single loss.
+        # Every seed has the draws of a single loss.
         gradient = torch.vmap(torch.func.grad(total, has_aux=True), randomness="same")
         gradients, outs = self.seeded(gradient, weights, stacked, data)
         for i, (loss, single) in enumerate(zip(losses, singles, strict=True)):
@@ -285,7 +285,7 @@ class LossChecks(ABC):
                 torch.testing.assert_close(gradients[key][i], expected, rtol=1e-3, atol=1e-5)
 
     def test_vmap_with_different_randomness_draws_for_every_seed(self) -> None:
-        """Equal seeds differ in their draws alone; a loss without draws gives equal numbers."""
+        """Copies of a batch differ only in draws; a loss without draws gives equal values."""
         loss, data = self.built(), self.data()
         draws = not all(
             torch.equal(first, second)

@@ -1,11 +1,11 @@
-"""A task for Gymnasium whose success and whose faults are known beforehand."""
+"""A Gymnasium task with planted success and faults."""
 
 import gymnasium as gym
 import numpy as np
 
 
 class Planted(gym.Env):
-    """Observes how many steps it took, succeeds from the second on, and breaks in the third."""
+    """Observes the step count, succeeds from step 2 on, and has its fault in step 3."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (2,), np.float64)

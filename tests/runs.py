@@ -1,4 +1,4 @@
-"""What tests of whole runs compare, and how they end one before its time."""
+"""For tests of whole runs: logged numbers to compare, killed runs, and stopped runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WALL_CLOCK = ("frames_per_second", "wall_seconds")
 
 
 def numbers(run: Path) -> dict[str, str]:
-    """Everything a run logged and concluded, but for the time it took."""
+    """Every log and the summary of a run, without wall-clock times and versions."""
     scalars = {
         path.relative_to(run).as_posix(): path.read_text()
         for path in sorted((run / "csv").rglob("*.csv"))
@@ -38,7 +38,7 @@ def has_saved(run: Path, stage: str) -> bool:
 
 
 def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
-    """A tiny run that ends, as if killed, when its checkpoint of so many frames is finished."""
+    """A tiny run that ends as if killed after its checkpoint at this number of frames."""
 
     def remember_and_die(self, stage, saved):
         remember(self, stage, saved)
@@ -53,7 +53,7 @@ def killed_when_saved(run: Path, frames: int, *overrides: str) -> None:
 
 
 def stopped(run: Path, *overrides: str, number: int = signal.SIGINT) -> Experiment:
-    """A tiny run that gets a signal in its seventh batch, upon which it saves and leaves."""
+    """A tiny run that gets a stop signal in its seventh batch, saves and ends."""
     experiment = Experiment(tiny(f"run_dir='{run}'", *overrides))
     collect = Stage.collect
 

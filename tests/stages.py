@@ -1,4 +1,4 @@
-"""Tiny stages, ready to collect, and whether they changed."""
+"""Tiny stages with collection started, and checks of what changed in them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchrl_etl.training.stage import Stage
 
 
 def explorer(*overrides):
-    """Stage 1, its exploration and its synergy model."""
+    """Stage 1 with its exploration and synergy model."""
     found = Explorer(Experiment(tiny("run_dir=unused", *overrides)).context)
     found.stage.restart_collection()
     return found
@@ -45,7 +45,7 @@ def fill(stage, batches: int = 6) -> None:
 
 
 def prepared(stage):
-    """A batch as the objective's losses read it."""
+    """A sampled batch, prepared as the losses of the objective read it."""
     return stage.learner.objective.prepare(stage.sample())
 
 
@@ -58,7 +58,7 @@ def changed(module: nn.Module, before: dict[str, torch.Tensor]) -> bool:
 
 
 def goes_on_after_a_load(make: Callable[[], Stage], folder: Path) -> bool:
-    """Whether a stage that was saved and its twin, loaded, then collect and learn the same."""
+    """Whether a saved stage and another one loaded from it then collect and learn the same."""
     stage, twin = make(), make()
     stage.restart_collection()
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""Rows of a sweep's results.csv, and the files and runs made of them."""
+"""Rows of results.csv, and runs, files and sweeps made of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchrl_etl.analysis.sweep_results import COLUMNS, read_sweep
 
-FEW = 50  # resamples of a bootstrap
+FEW = 50  # bootstrap resamples
 
 
 def row(**cells):

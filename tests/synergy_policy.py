@@ -1,4 +1,4 @@
-"""A small policy that acts through a decoder, and what it means that a batch is fresh."""
+"""A small policy with a synergy decoder, and checks that a batch is of its newest weights."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def synergy_policy() -> TensorDictSequential:
 
 
 def decode_to(policy: TensorDictSequential, value: float) -> torch.Tensor:
-    """From now on every action of the policy is one constant, which is returned."""
+    """Make every action of the policy one constant, and return it."""
     _make_constant(policy[1], value)
     with torch.no_grad():
         return policy[1](TensorDict({"synergy": torch.zeros(2)}))["action"][0]
 
 
 def act_around(policy: TensorDictSequential, value: float) -> None:
-    """From now on the actor writes this number as ``loc``."""
+    """Make the actor write this number as ``loc``."""
     _make_constant(policy[0], value)
 
 
@@ -50,7 +50,7 @@ def was_decoded_by(batch: TensorDictBase, policy: TensorDictSequential) -> bool:
 
 
 def assert_workers_differ(batch: TensorDictBase) -> None:
-    """Two workers, stacked: their episodes begin elsewhere, and explore otherwise."""
+    """Two stacked workers start their episodes in different states and draw different noise."""
     first, second = batch["observation"][:, :, 0]
     assert not torch.isclose(first[:, :2], second[:, :2]).any()
     noise = (batch["synergy"][:, :, 0].atanh() - batch["loc"][:, :, 0]) / batch["scale"][:, :, 0]
@@ -72,7 +72,7 @@ def assert_each_push_is_in_the_next_batch(
 
 
 def distinct_frames(batches: list[TensorDictBase]) -> int:
-    """Noise makes no two frames equal, unless one was delivered twice."""
+    """The number of distinct frames: noise makes frames equal only if delivered twice."""
     frames = torch.cat([batch.reshape(-1) for batch in batches])
     return len(torch.cat([frames["observation"], frames["synergy"]], -1).unique(dim=0))
 

@@ -1,4 +1,4 @@
-"""What every transform must pass before it may be called one."""
+"""Checks that every transform of this library must pass."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def collected(env: EnvBase, postproc) -> TensorDictBase:
 class TransformChecks(ABC):
     """Subclass as ``TestX``, give :meth:`transform`, and fill in the checks of values.
 
-    The layouts are checked here, for every transform alike. The abstract checks are those that
-    only the transform's author can write, because they say what its values must be.
+    Layouts are checked here, alike for every transform. The abstract checks depend on the values
+    of a transform, so its test class must define them.
     """
 
     @staticmethod
@@ -61,7 +61,7 @@ class TransformChecks(ABC):
 
     @classmethod
     def worker_envs(cls) -> list[Callable[[], EnvBase]]:
-        """What the workers of a collector step, with the same keys and values."""
+        """Constructors of the envs of collector workers, with the same keys and values."""
         return [cls.env] * WORKERS
 
     # Layouts
@@ -123,7 +123,7 @@ class TransformChecks(ABC):
 
     @abstractmethod
     def check_values(self, rollout) -> None:
-        """Hold a rollout of any layout (flat keys, time last) against what it must contain."""
+        """Check the values of a rollout of any layout (flat keys, time last)."""
 
     @pytest.mark.parametrize("batch_size", [(), (3,)])
     def test_rollout_values_are_right(self, batch_size):
@@ -167,7 +167,7 @@ class TransformChecks(ABC):
         for batch in batches:
             self.check_values(batch)
 
-    # Among other people's parts
+    # With other transforms and TorchRL components
 
     def test_a_later_transform_that_rewrites_the_observation_changes_no_values(self):
         def normalized(env):
@@ -200,7 +200,7 @@ class TransformChecks(ABC):
         return MultiStep(0.9, 3)
 
     def check_multi_step(self, moved, plain) -> None:  # noqa: B027 most have nothing to add
-        """What else must hold of a batch with n-step returns, beside the one without."""
+        """Further checks of a batch with n-step returns against the same batch without."""
 
     @pytest.mark.parametrize("batch_size", [(), (3,)])
     def test_agent_group_keeps_its_batch_size(self, batch_size):
@@ -216,7 +216,7 @@ class TransformChecks(ABC):
         check_env_specs(env)
         assert env.rollout(3)["observation"].dtype == torch.float64
 
-    # What the transform means elsewhere
+    # Outside of environments
 
     @abstractmethod
     def test_no_env(self):
