@@ -20,7 +20,7 @@ def test_iqm_is_the_mean_of_the_middle_half():
     assert iqm([values[:5], values[5:]], repetitions=0).mean == 4.5
 
 
-def test_iqm_interval_is_repeatable_leaves_numpy_alone_and_covers():
+def test_iqm_interval_is_deterministic_and_covers_the_true_mean():
     rng = np.random.default_rng(0)
     np.random.seed(5)
     expected = np.random.random()
@@ -59,14 +59,14 @@ def test_probability_of_improvement():
     assert both == (2.5 / 4 + 0) / 2
 
 
-def test_probability_of_improvement_is_rliables():
+def test_probability_of_improvement_equals_rliables():
     rng = np.random.default_rng(1)
     x, y = rng.integers(0, 5, (6, 3)).astype(float), rng.integers(0, 5, (4, 3)).astype(float)
     ours = probability_of_improvement(list(zip(x.T, y.T, strict=True)), repetitions=0).mean
     assert ours == pytest.approx(metrics.probability_of_improvement(x, y))
 
 
-def test_band_is_an_interval_of_the_mean_from_three_seeds_up():
+def test_mean_band_is_an_interval_from_three_seeds_and_the_range_of_two():
     values = np.array([[0.0, 5.0], [1.0, 5.0], [5.0, 5.0]])
     low, high = mean_band(values, repetitions=200)
     assert 0.0 <= low[0] < 2.0 < high[0] < 5.0 + 1e-9

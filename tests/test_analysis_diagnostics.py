@@ -26,7 +26,7 @@ class LinearDecoder(nn.Module):
         return synergy @ self.weight
 
 
-def test_authority_of_a_linear_decoder_is_known():
+def test_authority_of_a_linear_decoder_by_hand():
     # The middle 90 % of U[-1, 1] spans 1.8; actuator 0 covers its range, actuator 1 half of its
     # own, actuator 2 does not move.
     decoder = LinearDecoder([[1.0, 2.0, 0.0]], [-1.0, -4.0, 0.0], [1.0, 4.0, 1.0])
@@ -34,7 +34,7 @@ def test_authority_of_a_linear_decoder_is_known():
     torch.testing.assert_close(authority, torch.tensor([0.9, 0.45, 0.0]), atol=0.01, rtol=0)
 
 
-def test_authority_leaves_the_global_seed_alone_and_repeats():
+def test_authority_is_deterministic_and_leaves_the_global_rng_alone():
     decoder = SynergyDecoder(2, 5)
     state = torch.get_rng_state()
     first = control_authority(decoder)
@@ -44,13 +44,13 @@ def test_authority_leaves_the_global_seed_alone_and_repeats():
     assert not torch.equal(other, first)
 
 
-def test_effects_have_sign_and_are_relative_to_the_range():
+def test_synergy_effects_are_signed_and_relative_to_the_action_range():
     decoder = LinearDecoder([[1.0, -2.0], [0.0, 1.0]], [-1.0, 0.0], [1.0, 4.0])
     expected = torch.tensor([[1.0, -1.0], [0.0, 0.5]])
     torch.testing.assert_close(synergy_effects(decoder), expected)
 
 
-def test_a_residual_is_not_counted_as_synergy():
+def test_residual_is_left_out_of_authority_and_effects():
     plain, residual = SynergyDecoder(2, 5), SynergyDecoder(2, 5, residual=0.5)
     residual.load_state_dict(plain.state_dict())
     torch.testing.assert_close(control_authority(residual), control_authority(plain))
@@ -67,7 +67,7 @@ def test_alignment_by_hand():
         direction_alignment(along, ways[:3])
 
 
-def test_each_fault_gets_its_own_sentence_with_its_numbers():
+def test_each_fault_gives_one_warning_with_its_numbers():
     good = {"vaf": 0.8, "pca_vaf": 0.75, "authority": torch.tensor([0.4, 0.6])}
     assert synergy_warnings(**good) == []
     faults = {

@@ -11,7 +11,7 @@ from torchrl_etl.analysis import joint_effects
 TORQUES = np.array([[3.0, -3.0, 0.0, 0.0], [0.0, 0.0, 0.5, -0.5]])
 
 
-def test_opposed_changes_turn_joints_and_common_ones_do_not():
+def test_opposed_changes_turn_joints_and_co_contraction_does_not():
     opposed = np.array([[0.2, 0.0, 0.3, 0.1], [0.0, 0.2, 0.1, 0.3]])
     common = np.array([[0.2, 0.2, 0.0, 0.0], [0.0, 0.0, 0.3, 0.3]])
     assert joint_effects(opposed, TORQUES).share == pytest.approx(1.0)
@@ -19,7 +19,7 @@ def test_opposed_changes_turn_joints_and_common_ones_do_not():
     assert joint_effects(common, TORQUES).gain == pytest.approx(0.0)
 
 
-def test_a_single_muscle_turns_its_joint_with_half_of_its_variance():
+def test_single_muscle_has_share_one_half_and_gain_one():
     alone = np.array([[0.0, 0.4, 0.4, 0.4], [1.0, 0.4, 0.4, 0.4]])
     effects = joint_effects(alone, TORQUES)
     # Its direction (1, 0, 0, 0) has the share 1/2 along (1, -1, 0, 0) / √2. Rows of unit length
@@ -28,7 +28,7 @@ def test_a_single_muscle_turns_its_joint_with_half_of_its_variance():
     assert effects.gain == pytest.approx(1.0)
 
 
-def test_independent_muscles_have_the_share_and_the_gain_of_chance():
+def test_independent_muscles_have_chance_share_and_gain_one():
     noise = np.random.default_rng(0).uniform(size=(200_000, 4))
     effects = joint_effects(noise, TORQUES)
     assert effects.chance == 0.5
@@ -36,7 +36,7 @@ def test_independent_muscles_have_the_share_and_the_gain_of_chance():
     assert effects.gain == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_joint_that_repeats_another_does_not_raise_chance():
+def test_duplicate_joint_does_not_raise_chance():
     doubled = np.concatenate([TORQUES, 2 * TORQUES[:1]])
     assert joint_effects(np.eye(4), doubled).chance == 0.5
 
@@ -49,6 +49,6 @@ def test_a_joint_that_repeats_another_does_not_raise_chance():
         (np.ones((5, 4)), TORQUES, "do not vary"),
     ],
 )
-def test_what_does_not_fit_is_refused(activations, torques, words):
+def test_unusable_activations_and_torques_are_refused(activations, torques, words):
     with pytest.raises(ValueError, match=words):
         joint_effects(activations, torques)

@@ -31,7 +31,7 @@ def rows(seed=0, solved=True, start=0):
     ]
 
 
-def test_curves_from_rows_a_mapping_and_a_csv_file(tmp_path):
+def test_learning_curves_take_rows_a_mapping_or_a_csv_file(tmp_path):
     table = tmp_path / "evaluations.csv"
     with open(table, "w", newline="") as file:
         writer = csv.DictWriter(file, ["frames", "return", "seed", "solved"])
@@ -43,7 +43,7 @@ def test_curves_from_rows_a_mapping_and_a_csv_file(tmp_path):
         assert colors_of(path) > 20
 
 
-def test_curve_averages_seeds_only_over_frames_all_of_them_reached():
+def test_curve_averages_over_the_frames_that_all_seeds_reached():
     short = [{"frames": f, "return": 10.0, "seed": 1} for f in (0, 1000)]
     long = [{"frames": f, "return": 20.0, "seed": 2} for f in (500, 1500, 3000)]
     frames, mean, low, high = _curve(
@@ -73,7 +73,7 @@ def test_heatmap(tmp_path, n, d, residual):
         synergy_heatmap(decoder, ["a", "b"], path)
 
 
-def test_vaf_curve_with_a_method_measured_at_one_number_only(tmp_path):
+def test_vaf_curve_takes_a_method_measured_at_one_dimension(tmp_path):
     nan = float("nan")
     series = {"GMVAE": [nan, 0.8, nan], "PCA": [0.3, 0.6, 0.9], "NMF": [-0.2, 0.4, 0.8]}
     assert colors_of(vaf_curve([1, 4, 8], series, tmp_path / "vaf.png", chosen_d=4)) > 20
@@ -93,12 +93,12 @@ def test_embedding_of_a_collapsed_encoder(tmp_path):
     assert embedding(np.zeros((9, 3)), np.eye(3)[[0, 1, 2] * 3], tmp_path / "e.png").exists()
 
 
-def test_embedding_wants_one_direction_per_state(tmp_path):
+def test_embedding_needs_one_direction_per_state(tmp_path):
     with pytest.raises(ValueError, match=r"\(9, 3\) and directions to \(3, 3\)"):
         embedding(np.zeros((9, 3)), np.eye(3), tmp_path / "e.png")
 
 
-def test_a_failed_drawing_leaves_the_old_picture_and_no_litter(tmp_path, monkeypatch):
+def test_failed_drawing_keeps_the_old_picture_and_leaves_no_other_file(tmp_path, monkeypatch):
     path = vaf_curve([1, 2], {"PCA": [0.5, 0.6]}, tmp_path / "vaf.png")
     before = path.read_bytes()
 

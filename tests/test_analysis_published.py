@@ -11,7 +11,7 @@ from torchrl_etl.analysis.published import best_published, caveats, environment_
 from torchrl_etl.envs import list_tasks, resolve_task
 
 
-def test_published_rows_belong_to_tasks_of_ours():
+def test_published_rows_belong_to_known_tasks():
     published = {
         environment_id(task.name, goal)
         for task in (*list_tasks(), resolve_task("myo2HandPose"))

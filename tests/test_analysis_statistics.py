@@ -8,7 +8,7 @@ import pytest
 from torchrl_etl.analysis.statistics import interval, success_interval
 
 
-def test_interval_covers_the_true_mean_about_as_often_as_it_says():
+def test_interval_has_nominal_coverage():
     rng = np.random.default_rng(0)
     samples = rng.exponential(2.0, size=(60, 30))
     hits = sum(low <= 2.0 <= high for _, low, high in map(interval, samples))
@@ -23,7 +23,7 @@ def test_interval_is_deterministic_and_widens_with_confidence():
     assert lower < low < mean < high < higher
 
 
-def test_interval_of_constant_values_is_a_point_and_of_one_value_unknown():
+def test_interval_of_constants_is_a_point_and_of_one_value_nan():
     assert interval([2.5] * 4) == (2.5, 2.5, 2.5)
     mean, low, high = interval([2.5])
     assert mean == 2.5 and math.isnan(low) and math.isnan(high)

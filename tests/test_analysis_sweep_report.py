@@ -15,18 +15,18 @@ def report(*arguments):
     recipe_module("report").main([*arguments, f"repetitions={FEW}"])
 
 
-def test_looks_are_distinct_and_never_the_published_grey():
+def test_line_styles_are_distinct_and_never_the_grey_of_published_curves():
     styles = looks([f"method {i}" for i in range(21)])
     assert len({(s["color"], s["linestyle"]) for s in styles.values()}) == 21
     assert "#666666" not in {style["color"] for style in styles.values()}
 
 
-def test_every_published_algorithm_has_a_look():
+def test_every_published_algorithm_has_a_line_style():
     shown = [published_curves("dog-run"), published_curves("myoHandKeyTurnFixed-v0", "success")]
     assert {curve.algorithm for curves in shown for curve in curves} == set(_PUBLISHED)
 
 
-def test_a_published_failure_does_not_flatten_the_curves(tmp_path, monkeypatch):
+def test_published_outlier_is_in_the_caption_and_not_on_the_axis(tmp_path, monkeypatch):
     """FlashSAC's Pen Twirl is published at −4,833 after 100,000 frames."""
     figures = []
     monkeypatch.setattr(
@@ -40,7 +40,7 @@ def test_a_published_failure_does_not_flatten_the_curves(tmp_path, monkeypatch):
     assert caveats("myoHandPenTwirlFixed-v0") in caption
 
 
-def test_pictures_refuse_nothing_to_draw(tmp_path):
+def test_pictures_without_runs_or_methods_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no finished runs"):
         task_picture([], {}, tmp_path / "x.png")
     with pytest.raises(ValueError, match="No method"):
@@ -103,7 +103,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
         (["{}"], "not of the form key=value", ""),
     ],
 )
-def test_a_wrong_command_gets_one_sentence(tmp_path, capsys, arguments, code, words):
+def test_wrong_arguments_end_in_one_line_of_error(tmp_path, capsys, arguments, code, words):
     folder = write(tmp_path / "sweep", run([0, 1]))
     with pytest.raises(SystemExit) as exit_:
         report(*(argument.format(folder) for argument in arguments))
@@ -114,7 +114,7 @@ def test_a_wrong_command_gets_one_sentence(tmp_path, capsys, arguments, code, wo
         assert code in exit_.value.code
 
 
-def test_nothing_finished_is_said(tmp_path, capsys):
+def test_report_without_finished_runs_says_so(tmp_path, capsys):
     folder = write(tmp_path / "sweep", run([0, 1], status="running"))
     with pytest.raises(SystemExit):
         report(f"results={folder}")

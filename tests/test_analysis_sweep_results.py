@@ -8,13 +8,13 @@ from tests.sweep_rows import row, run, sweep, write
 from torchrl_etl.analysis.sweep_results import COLUMNS, read_sweep
 
 
-def test_newest_row_wins_and_takes_the_older_attempts_tail_along(tmp_path):
+def test_newest_attempt_replaces_all_rows_of_the_older_one(tmp_path):
     results = sweep(tmp_path, run([0, 1, 2, 3]), run([10, 11, 12]))
     assert [one.mean_return for one in results.runs[0].rows] == [10, 11, 12]
     assert results.replaced == 4 and results.row_count == 7
 
 
-def test_a_run_is_as_finished_as_its_newest_row(tmp_path):
+def test_status_of_a_run_is_that_of_its_newest_row(tmp_path):
     broken = run([0, 1], seed=1, status="diverged")
     broken[-1]["return"] = "nan"
     going = run([0, 1], seed=2, status="running")
@@ -50,7 +50,7 @@ def test_a_bad_cell_is_named_with_its_line(tmp_path, cells, words):
         read_sweep(folder)
 
 
-def test_missing_things_are_named(tmp_path):
+def test_missing_folder_file_columns_and_rows_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="There is no folder"):
         read_sweep(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=r"has no results\.csv"):

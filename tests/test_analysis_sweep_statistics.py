@@ -8,7 +8,7 @@ from tests.sweep_rows import FEW, run, sweep
 from torchrl_etl.analysis.sweep_statistics import Scale, common_budget, compare, normalize, overall
 
 
-def test_budget_is_the_most_that_all_runs_share(tmp_path):
+def test_budget_is_the_largest_that_all_runs_reached(tmp_path):
     sac = run([0, 1, 2], [0, 50_000, 100_000])
     etl = run([0, 3, 5, 6], [0, 49_900, 99_000, 150_000], method="etl")
     runs = sweep(tmp_path, sac, etl).runs
@@ -24,7 +24,7 @@ def test_budget_is_the_most_that_all_runs_share(tmp_path):
     assert [one.method for one in comparison.stale] == ["sac"]
 
 
-def test_a_batch_more_or_less_at_the_end_changes_nothing(tmp_path):
+def test_budget_tolerates_a_batch_more_or_less(tmp_path):
     sac = run([0, 1, 2], [0, 45_056, 50_048])
     sar = run([0, 3, 4], [0, 45_064, 50_056], method="sar")
     late = run([0, 5, 6], [0, 49_000, 50_600], method="etl")
@@ -38,14 +38,14 @@ def test_a_batch_more_or_less_at_the_end_changes_nothing(tmp_path):
     assert compare(runs, ["etl"], "sac", frames=50_000).result("etl").returns.tolist() == [5.0]
 
 
-def test_runs_that_end_before_an_asked_budget_are_left_out(tmp_path):
+def test_runs_shorter_than_a_given_budget_are_left_out(tmp_path):
     runs = sweep(tmp_path, run([0, 1, 2, 3]), run([0, 5], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", frames=150_000, repetitions=FEW)
     assert comparison.result("etl") is None
     assert [one.method for one in comparison.short] == ["etl"]
 
 
-def test_frames_to_the_controls_return_are_those_of_the_mean_over_seeds(tmp_path):
+def test_frames_to_the_controls_return_use_the_mean_over_seeds(tmp_path):
     frames = [0, 10, 20, 30]
     results = sweep(
         tmp_path,
@@ -62,7 +62,7 @@ def test_frames_to_the_controls_return_are_those_of_the_mean_over_seeds(tmp_path
     assert alone.result("etl").frames_to_control is None
 
 
-def test_unequal_seeds_and_missing_tasks(tmp_path):
+def test_overall_iqm_with_unequal_seeds_and_a_missing_task(tmp_path):
     """By hand. Key Turn at 100,000: zero −100, one 2211.99 (FlashSAC). Leg Walk: one is SAC's."""
     turn = [run([-100, 0, 2211.99], method="sac", seed=s) for s in (0, 1, 2)]
     better = [run([-100, 0, 2211.99 + 2311.99], method="etl", seed=s) for s in (0, 1)]
@@ -87,7 +87,7 @@ def test_unequal_seeds_and_missing_tasks(tmp_path):
     assert etl.control_iqm == pytest.approx(1.0) and etl.improvement == (1.0, 1.0, 1.0)
 
 
-def test_a_task_without_a_sound_scale_says_why(tmp_path):
+def test_task_that_cannot_be_normalized_says_why(tmp_path):
     other = run([0, 1, 2], task="myoLegWalk", method="etl")
     worse = run([0, -1, -2], task="myoRelocate")
     for rows, words in ((other, "sac lacks the task"), (worse, "is not above the untrained")):

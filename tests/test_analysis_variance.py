@@ -25,7 +25,7 @@ def test_vaf_by_hand():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.1, -3.0])
-def test_vaf_of_constant_actions_is_one_when_they_are_met_and_zero_when_not(value):
+def test_vaf_of_constant_actions_is_one_if_exact_and_zero_otherwise(value):
     actions = torch.full((50, 3), value)
     assert variance_accounted_for(actions, actions.clone()) == 1.0
     assert variance_accounted_for(actions, actions + 0.01) == 0.0
@@ -50,7 +50,7 @@ def test_nmf_refuses_actions_below_the_bound():
         nmf_vaf(low_rank_actions() - 0.5, 2, low=0.0)
 
 
-def test_large_data_are_subsampled_alike_every_time():
+def test_large_data_are_subsampled_deterministically():
     actions = low_rank_actions(count=6000, noise=0.1).clip(0.0)
     assert nmf_vaf(actions, 2, 0.0, max_samples=500) == nmf_vaf(actions, 2, 0.0, max_samples=500)
     assert pca_vaf(actions, 2, max_samples=500) == pytest.approx(pca_vaf(actions, 2), abs=0.05)

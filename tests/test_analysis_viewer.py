@@ -48,12 +48,12 @@ def open_session(**parts) -> Session:
     return Session(replace(subject, **parts))
 
 
-def test_a_paused_session_lets_time_pass_without_a_step():
+def test_paused_session_takes_no_steps():
     session = open_session()
     assert session.advance(10.0) == 0 and session.steps == 0
 
 
-def test_a_slider_moves_the_muscles_at_once_and_then_the_body_rests():
+def test_moving_a_slider_steps_a_paused_session_for_600_ms():
     session = open_session()
     session.move(1, 0.5)
     assert session.advance(0.1, patience=10.0) == 5  # 20 ms a step
@@ -63,21 +63,21 @@ def test_a_slider_moves_the_muscles_at_once_and_then_the_body_rests():
     assert not session.playing
 
 
-def test_playing_takes_as_many_steps_as_its_speed_says():
+def test_playing_steps_at_the_set_speed():
     session = open_session()
     session.playing, session.speed = True, 0.5
     assert session.advance(0.4, patience=10.0) == 10
     assert session.steps == 10
 
 
-def test_a_slow_simulator_falls_behind_and_owes_nothing():
+def test_slow_simulator_does_not_catch_up_on_missed_time():
     session = open_session()
     session.playing = True
     assert session.advance(3600.0, patience=0.01) < 1000
     assert session.advance(0.02, patience=10.0) == 1
 
 
-def test_sliders_go_on_after_the_end_and_a_policy_begins_the_next_episode():
+def test_sliders_continue_past_the_end_and_the_policy_starts_an_episode():
     decoder = make_decoder()
     session = open_session(decoder=decoder, policy=acting(0.3, decoder))
     assert session.driver == "policy"
@@ -92,7 +92,7 @@ def test_sliders_go_on_after_the_end_and_a_policy_begins_the_next_episode():
     assert (session.episode, session.steps) == (1, 1)
 
 
-def test_an_episode_is_the_one_that_evaluation_sees():
+def test_episode_equals_that_of_evaluate():
     decoder = make_decoder()
     policy = acting(0.3, decoder)
     session = open_session(decoder=decoder, policy=policy)
@@ -104,7 +104,7 @@ def test_an_episode_is_the_one_that_evaluation_sees():
     assert session.solved_steps == found.solved_steps[1]
 
 
-def test_the_policy_s_coefficients_stand_on_the_sliders():
+def test_sliders_show_the_policys_coefficients():
     decoder = make_decoder()
     session = open_session(decoder=decoder, policy=acting(0.25, decoder))
     session.step()
@@ -121,7 +121,7 @@ def test_a_policy_without_synergies_needs_no_decoder():
         session.drive("sliders")
 
 
-def test_without_its_residual_a_policy_moves_muscles_through_synergies_alone():
+def test_policy_with_the_residual_off_acts_through_synergies_only():
     decoder = make_decoder(residual=0.5)
     session = open_session(decoder=decoder, policy=acting(0.25, decoder))
     assert session.has_residual
@@ -133,7 +133,7 @@ def test_without_its_residual_a_policy_moves_muscles_through_synergies_alone():
     assert torch.equal(session.action, alone) and not torch.equal(whole, alone)
 
 
-def test_stage_1_s_policy_follows_the_direction_that_is_chosen():
+def test_stage_1_policy_follows_the_chosen_direction():
     seen = []
 
     def act(observation: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
@@ -150,7 +150,7 @@ def test_stage_1_s_policy_follows_the_direction_that_is_chosen():
         session.follow(torch.zeros(3))
 
 
-def test_another_goal_begins_anew_in_a_simulator_of_its_own():
+def test_choosing_a_goal_starts_an_episode_in_a_new_simulator():
     session = open_session()
     first = session.env
     session.step()
@@ -160,7 +160,7 @@ def test_another_goal_begins_anew_in_a_simulator_of_its_own():
         session.choose_goal("near")
 
 
-def test_a_goal_that_cannot_be_built_leaves_the_simulator_before():
+def test_goal_that_cannot_be_built_keeps_the_old_simulator():
     session = open_session()
 
     def make(goal):
@@ -176,17 +176,17 @@ def test_a_goal_that_cannot_be_built_leaves_the_simulator_before():
     assert session.goal == "fixed" and session.steps == 2 and not session.env.is_closed
 
 
-def test_what_nothing_can_move_is_refused():
+def test_subject_without_policy_and_synergies_is_refused():
     with pytest.raises(ValueError, match="neither a policy nor synergies"):
         open_session(decoder=None)
 
 
-def test_a_coefficient_out_of_its_box_is_refused():
+def test_coefficient_outside_the_box_is_refused():
     with pytest.raises(ValueError, match=re.escape("in [-1, 1]")):
         open_session().move(0, 1.5)
 
 
-def test_sliders_move_a_body_that_is_held_where_it_stands():
+def test_sliders_move_joints_while_the_root_is_held():
     names = actuator_names("humanoid-stand")
     directions = torch.zeros(1, len(names))
     directions[0, names.index("right_elbow")] = 0.9
@@ -233,25 +233,25 @@ def body() -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def test_tendons_run_where_their_sites_are_and_motors_sit_at_their_joints(body):
+def test_paths_follow_tendon_sites_and_motors_sit_at_their_joints(body):
     path = paths(*body)
     np.testing.assert_allclose(path.start, [[0, 0, 0], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(path.end, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
     assert path.actuator.tolist() == [1, 0]
 
 
-def test_a_muscle_is_as_active_as_its_state_and_a_motor_as_its_control(body):
+def test_activation_is_a_muscles_state_and_a_motors_control(body):
     model, data = body
     data.ctrl[:], data.act[:] = [-1.0, 0.9], [0.25]
     assert activations(model, data).tolist() == [-0.5, 0.25]
 
 
-def test_rest_pull_and_push_have_colours_of_their_own():
+def test_rest_pull_and_push_have_distinct_colors():
     rest, pull, push = colors(np.array([0.0, 1.0, -1.0])).astype(int)
     assert pull[0] > rest[0] > push[0] and push[2] > rest[2] > pull[2]
 
 
-def test_driven_muscles_are_the_heat_map_s_strongest_first():
+def test_driven_muscles_are_sorted_by_effect_without_weak_ones():
     directions = torch.tensor([[0.0, 0.5, -1.0], [0.001, 0.0, 0.0]])
     decoder = SynergyDecoder.from_directions(torch.zeros(3), directions)
     first, second = driven_muscles(decoder, ["a", "b", "c"])
@@ -260,12 +260,12 @@ def test_driven_muscles_are_the_heat_map_s_strongest_first():
     assert first[0][1] == pytest.approx(-np.tanh(1.0))
 
 
-def test_names_from_a_model_are_no_html():
+def test_model_names_are_escaped_in_html():
     assert "<b>" not in driven_list([("<b>", 0.5)])
     assert "<b>" not in activation_grid(["<b>"], np.zeros(1))
 
 
-def test_the_page_tells_return_and_whether_the_episode_counts_as_solved():
+def test_status_shows_the_return_and_whether_the_episode_is_solved():
     session = open_session()
     assert "return <b>0.0</b>" in status(session) and "0 steps of 6 needed" in status(session)
     session.solved, session.solved_steps = True, 6
@@ -275,7 +275,7 @@ def test_the_page_tells_return_and_whether_the_episode_counts_as_solved():
 @pytest.mark.parametrize(
     ("task", "under_a_skin"), [("dog-walk", 144), ("myoElbowPose1D6MRandom-v0", 0)]
 )
-def test_bones_are_drawn_in_place_of_a_skin(task, under_a_skin):
+def test_bones_under_a_skin_are_shown(task, under_a_skin):
     env = make_env(task)
     model, _ = mujoco_state(env)
     usual = model.geom_group < SHOWN_GROUPS

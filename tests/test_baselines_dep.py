@@ -76,7 +76,7 @@ def test_matrix_is_normalized_by_rows_or_by_columns(normalize: str, expected: An
     close(controller.weights()[0], [[2 * x for x in row] for row in expected])
 
 
-def test_a_command_can_have_another_sign_by_columns_than_by_rows() -> None:
+def test_command_signs_differ_between_row_and_column_normalization() -> None:
     commands = []
     for normalize in ("rows", "columns"):
         controller = DEPController(1, 2, kappa=2.0, tau=2, time_distance=2, normalize=normalize)
@@ -104,7 +104,7 @@ def test_commands_and_bias_of_two_antagonists() -> None:
     close(fourth[0], [math.tanh(math.sqrt(2) + 0.05), -math.tanh(math.sqrt(2) + 0.05)])
 
 
-def test_bias_is_worn_down_and_decays() -> None:
+def test_bias_opposes_the_command_and_decays() -> None:
     controller, (*_, third, fourth) = antagonists(bias_rate=0.01)
     close(controller.bias, (-0.01 * third).tolist())
     before = controller.bias = torch.tensor([[0.5, -0.25]])
@@ -112,7 +112,7 @@ def test_bias_is_worn_down_and_decays() -> None:
     close(controller.bias, (before - 0.01 * fourth - 0.001 * before).tolist())
 
 
-def test_rows_are_normalised_by_kappa() -> None:
+def test_rows_are_scaled_to_length_kappa() -> None:
     """Rows (3, 4), (0, -2) become κ(0.6, 0.8), κ(0, -1): q is along (1.4, -1) for x = (1, 1)."""
     controller = DEPController(1, 2, kappa=0.5, tau=1, time_distance=1, bias_rate=0.0)
     controller.matrix = lambda: torch.tensor([[[3.0, 4.0], [0.0, -2.0]]])
@@ -123,7 +123,7 @@ def test_rows_are_normalised_by_kappa() -> None:
 
 
 @pytest.mark.parametrize(("tau", "distance", "steps"), [(4, 2, 12), (3, 5, 20), (40, 5, 12)])
-def test_matrix_is_the_sum_of_the_paper(tau: int, distance: int, steps: int) -> None:
+def test_matrix_equals_the_papers_sum(tau: int, distance: int, steps: int) -> None:
     rows, n = 2, 3
     controller = DEPController(rows, n, tau=tau, time_distance=distance, dtype=torch.float64)
     sensed = []
@@ -142,7 +142,7 @@ def test_matrix_is_the_sum_of_the_paper(tau: int, distance: int, steps: int) -> 
     torch.testing.assert_close(controller.matrix(), expected)
 
 
-def test_a_body_at_rest_is_left_at_rest() -> None:
+def test_constant_lengths_give_zero_commands() -> None:
     controller = DEPController(2, 4)
     for _ in range(60):
         command = controller.step(torch.full((2, 4), 0.3))
@@ -157,7 +157,7 @@ def test_commands_are_bounded_and_finite_for_any_lengths() -> None:
         assert command.isfinite().all() and command.abs().max() <= 1
 
 
-def test_a_reset_is_no_movement_and_forgets_nothing_else() -> None:
+def test_reset_records_no_movement_and_keeps_the_other_memory() -> None:
     controller = DEPController(3, 4)
     for _ in range(20):
         controller.step(torch.rand(3, 4))

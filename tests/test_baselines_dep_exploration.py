@@ -67,7 +67,7 @@ def test_dep_acts_alone_for_its_frames_and_the_policy_afterwards() -> None:
 
 
 @pytest.mark.parametrize("length", [1, 5])
-def test_bursts_last_exactly_their_length(length: int) -> None:
+def test_bursts_last_exactly_intervention_length(length: int) -> None:
     module = DEPExploration(SPEC, dep_frames=0, probability=0.1, intervention_length=length)
     acted = replaced(module, 400, rows=3)
     for row in acted.T:
@@ -78,7 +78,7 @@ def test_bursts_last_exactly_their_length(length: int) -> None:
     assert not torch.equal(acted[:, 0], acted[:, 1])  # each row draws for itself
 
 
-def test_share_of_bursts_is_that_of_the_probability() -> None:
+def test_bursts_begin_with_the_given_probability() -> None:
     """A policy's step begins a burst with p: bursts per policy's step are p, within 3 sigma."""
     p, rows, steps = 0.02, 50, 300
     acted = replaced(DEPExploration(SPEC, dep_frames=0, probability=p), steps, rows)
@@ -97,11 +97,11 @@ def test_every_third_episode_is_the_policys(ids: bool) -> None:
         assert not acted[episode, 0].any()  # a burst ends with its episode
 
 
-def test_dep_alone_also_takes_the_third_episode() -> None:
+def test_initial_dep_frames_include_the_third_episode() -> None:
     assert replaced(DEPExploration(SPEC, dep_frames=10_000), 40, episode=10).all()
 
 
-def test_without_an_episode_entry_all_is_one_episode() -> None:
+def test_without_an_episode_entry_all_steps_are_one_episode() -> None:
     module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=2)
     assert replaced(module, 20).any()
     module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=1)
@@ -109,7 +109,7 @@ def test_without_an_episode_entry_all_is_one_episode() -> None:
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, None])
-def test_it_passes_through_and_does_not_adapt_unless_exploration_is_random(
+def test_dep_is_inactive_unless_exploration_is_random(
     kind: ExplorationType | None,
 ) -> None:
     module = DEPExploration(SPEC, dep_frames=100)
@@ -124,7 +124,7 @@ def test_it_passes_through_and_does_not_adapt_unless_exploration_is_random(
             assert value == before[name], name
 
 
-def test_it_adapts_while_the_policy_acts() -> None:
+def test_controller_adapts_while_the_policy_acts() -> None:
     """The action of a burst is the one of a controller that saw every step."""
     module = DEPExploration(SPEC, dep_frames=0, probability=0.0)
     alone = DEPController(2, MUSCLES)
@@ -138,7 +138,7 @@ def test_it_adapts_while_the_policy_acts() -> None:
     torch.testing.assert_close(td["action"], (command + 1) / 2)
 
 
-def test_an_episodes_first_lengths_are_no_movement() -> None:
+def test_first_step_of_an_episode_records_no_movement() -> None:
     module = DEPExploration(SPEC, dep_frames=0)
     replaced(module, 11, episode=10)
     assert not module.controller.moves[:, 0].any()
@@ -189,7 +189,7 @@ def test_batch_shapes_and_nested_keys(batch: tuple[int, ...]) -> None:
     assert torch.equal(out["agent", "length"], length)
 
 
-def test_rows_do_not_depend_on_others() -> None:
+def test_rows_are_independent() -> None:
     lengths, others = torch.rand(2, 60, 3, MUSCLES)
     others[:, 1] = lengths[:, 1]
     seen = []
@@ -206,7 +206,7 @@ def test_rows_do_not_depend_on_others() -> None:
     assert not torch.equal(seen[0][:, 0], seen[1][:, 0])
 
 
-def test_another_number_of_rows_starts_anew_but_for_the_frames() -> None:
+def test_new_batch_size_resets_the_controller_and_keeps_the_frame_count() -> None:
     module = DEPExploration(SPEC, dep_frames=20, probability=0.0)
     replaced(module, 10, rows=2)
     assert module.controller.moves.any()
@@ -215,7 +215,7 @@ def test_another_number_of_rows_starts_anew_but_for_the_frames() -> None:
     assert not module.controller.moves.any()
 
 
-def test_memory_is_not_in_the_state_dict_and_copies_are_independent() -> None:
+def test_state_dict_excludes_memory_and_copies_are_independent() -> None:
     module = DEPExploration(SPEC)
     replaced(module, 10)
     assert not module.state_dict() and not list(module.parameters())
@@ -227,7 +227,7 @@ def test_memory_is_not_in_the_state_dict_and_copies_are_independent() -> None:
     assert torch.equal(module.controller.moves, before) and module.frames == 20
 
 
-def test_no_device_is_cached() -> None:
+def test_module_follows_device_and_dtype() -> None:
     module = DEPExploration(SPEC).to("meta")
     assert module.low.is_meta
     module = DEPExploration(SPEC).double()
@@ -252,7 +252,7 @@ def test_bad_specs_and_settings_are_refused() -> None:
             DEPExploration(SPEC, **settings)
 
 
-def test_missing_or_foreign_lengths_are_explained() -> None:
+def test_missing_or_wrong_muscle_lengths_are_refused() -> None:
     module = DEPExploration(SPEC)
     td = TensorDict({"action": torch.zeros(2, 3)}, [2])
     with set_exploration_type(ExplorationType.RANDOM):
@@ -266,7 +266,7 @@ def test_missing_or_foreign_lengths_are_explained() -> None:
 
 
 @pytest.mark.parametrize("collector_class", [Collector, VectorCollector])
-def test_a_collector_records_what_dep_did(collector_class: type[Collector]) -> None:
+def test_collector_records_deps_actions(collector_class: type[Collector]) -> None:
     env = make_env("myoHandPose", num_envs=2, seed=0, muscle_lengths=True)
     key: Any = ("collector", "traj_ids")
     if collector_class is Collector:
@@ -290,7 +290,7 @@ def test_a_collector_records_what_dep_did(collector_class: type[Collector]) -> N
     assert dep._episode.tolist() == [2, 2] and dep.frames == 210  # episodes are 100 steps long
 
 
-def test_a_policy_with_an_actor_gives_its_loss_the_actors_gradient() -> None:
+def test_dep_leaves_the_gradient_of_the_actor_intact() -> None:
     """DEP replaces what was sampled, and leaves alone what the loss evaluates."""
     actor = make_actor({"observation": 2}, SPEC, hidden=(8,))
     policy = TensorDictSequential(actor, DEPExploration(SPEC))

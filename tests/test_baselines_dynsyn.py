@@ -41,7 +41,7 @@ def test_indices_of_groups() -> None:
 
 
 @pytest.mark.parametrize("wrong", [[0, 2], [1, 1], [], [[0, 1]], [0.0, 1.0], [-1, 0]])
-def test_groups_that_are_not_numbered_are_refused(wrong: list) -> None:
+def test_groups_not_numbered_consecutively_are_refused(wrong: list) -> None:
     with pytest.raises(ValueError, match="every number from 0 to the largest"):
         MuscleGroups.of(wrong)
 
@@ -97,7 +97,7 @@ def test_weights_by_hand() -> None:
     torch.testing.assert_close(dist.deterministic_sample, torch.tensor(expected))
 
 
-def test_deviations_are_drawn_with_the_printed_spread() -> None:
+def test_deviations_have_the_papers_standard_deviation() -> None:
     # 0.1 tanh N(μ, e^½): the inverse of the weights is that Gaussian. In double precision weights
     # near ±10 % can still be told apart.
     mu = torch.tensor([0.4, -0.3, 0.0], dtype=torch.float64)
@@ -128,7 +128,7 @@ def test_log_prob_is_that_of_the_groups_alone() -> None:
     assert (dist.batch_shape, dist.event_shape) == ((50,), (6,))
 
 
-def test_actions_stay_in_every_muscles_own_bounds() -> None:
+def test_actions_stay_within_each_muscles_bounds() -> None:
     dist = GroupedTanhNormal(
         *(10 * torch.randn(500, 3), torch.ones(500, 3), torch.randn(500, 3)),
         torch.tensor([0.1]),
@@ -145,7 +145,7 @@ def test_actions_stay_in_every_muscles_own_bounds() -> None:
     torch.testing.assert_close(height[:, 4], height[:, 1], atol=0.06, rtol=0)
 
 
-def test_one_muscle_a_group_is_the_ordinary_tanh_normal() -> None:
+def test_groups_of_one_muscle_equal_a_tanh_normal() -> None:
     loc, scale = torch.randn(2, 5, 6)
     dist = GroupedTanhNormal(
         loc,
@@ -193,14 +193,14 @@ def test_amplitude_schedule_by_hand(frames: int, amplitude: float) -> None:
     torch.testing.assert_close(written, torch.full((2, 1), amplitude))
 
 
-def test_schedule_is_an_option() -> None:
+def test_amplitude_schedule_is_configurable() -> None:
     actor = actor_on(slope=1e-4, start=100, ceiling=0.02)
     for frames, amplitude in ((100, 0.0), (200, 0.01), (1000, 0.02)):
         set_frames(actor, frames)
         torch.testing.assert_close(actor[0].module.amplitude.item(), amplitude)
 
 
-def test_frames_travel_with_the_weights() -> None:
+def test_state_dict_carries_the_amplitude() -> None:
     one, other = actor_on(), actor_on()
     set_frames(one, 2_000_000)
     other.load_state_dict(one.state_dict())
@@ -210,7 +210,7 @@ def test_frames_travel_with_the_weights() -> None:
         torch.testing.assert_close(one(data.clone())["action"], other(data.clone())["action"])
 
 
-def test_a_loss_built_on_the_actor_sees_its_frames() -> None:
+def test_loss_sees_frames_set_on_the_actor() -> None:
     actor = actor_on()
     critic = make_critic({"observation": 4, "action": 6}, hidden=(8,))
     loss = LeanSACLoss(actor, critic, target_entropy=-3.0)
@@ -234,7 +234,7 @@ def test_gradients_reach_scales_and_deviations() -> None:
     assert by_score.tolist() == [True] * 6 + [False] * 3  # k means, k scales, no deviation
 
 
-def test_deviations_are_learned_only_once_they_are_allowed() -> None:
+def test_deviations_get_no_gradient_at_amplitude_zero() -> None:
     actor = actor_on()
     actor.get_dist(observations(64)).rsample().sum().backward()
     assert not actor[0].module.layers[-1].weight.grad[6:].any()
@@ -254,13 +254,13 @@ def test_bad_input_is_refused_at_construction(groups: Any, options: Any, message
         make_dynsyn_actor({"observation": 4}, SPEC, groups, **options)
 
 
-def test_follows_its_module_to_another_precision() -> None:
+def test_actor_follows_a_change_of_dtype() -> None:
     actor = actor_on().double()
     assert actor(observations(5).double())["action"].dtype == torch.float64
     assert actor.float()(observations(5))["action"].dtype == torch.float32
 
 
-def test_acts_on_bare_arrays_as_the_vector_collector_has_them() -> None:
+def test_policy_on_arrays_matches_the_actor() -> None:
     actor, data = actor_on(), observations(3)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         on_arrays = PolicyOnArrays(actor)

@@ -76,7 +76,7 @@ class TestEMELoss(LossChecks):
             root, after = {"agent": root}, {"agent": after}
         return TensorDict(root | {"next": TensorDict(after, batch)}, batch)
 
-    def test_the_policy_gets_no_gradient_and_is_left_out(self) -> None:
+    def test_policy_gets_no_gradient_and_is_no_parameter(self) -> None:
         loss = self.built()
         sum(self.losses(loss(self.data())).values()).backward()
         assert all(parameter.grad is None for parameter in loss.actor.parameters())
@@ -86,7 +86,7 @@ class TestEMELoss(LossChecks):
         }
         assert not any("actor" in name for name in loss.state_dict())
 
-    def test_reset_cast_and_mode_leave_the_policy_alone(self) -> None:
+    def test_reset_dtype_and_mode_of_the_loss_leave_the_policy_alone(self) -> None:
         loss = self.built()
         before = copy.deepcopy(dict(loss.actor.state_dict()))
         loss.actor.train()
@@ -95,7 +95,7 @@ class TestEMELoss(LossChecks):
         for name, value in loss.actor.state_dict().items():
             assert value.dtype == before[name].dtype and torch.equal(value, before[name])
 
-    def test_the_policy_is_never_stale(self) -> None:
+    def test_loss_reads_the_current_policy_weights(self) -> None:
         loss, data = self.built(), self.data()
         before = self.seeded(loss, data)["mean_policy_divergence"]
         with torch.no_grad():
@@ -150,7 +150,7 @@ def kl(i: int, j: int) -> float:
     return (deviation**2 + (mean / SCALE[j][0]) ** 2 - 1) / 2 - math.log(deviation)
 
 
-def test_divergence_of_policies_is_that_of_torch() -> None:
+def test_policy_divergence_equals_torchs_kl() -> None:
     loc, scale = torch.randn(2, 6), 0.1 + torch.rand(2, 6)
     actor = policy(loc.tolist(), scale.tolist())
     loss = EMELoss(table(*ROWS[:2]), predictors(PREDICTIONS[:2]), actor)
@@ -160,7 +160,7 @@ def test_divergence_of_policies_is_that_of_torch() -> None:
     torch.testing.assert_close(out["mean_policy_divergence"], expected)
 
 
-def test_divergence_of_gaussians_is_that_of_the_squashed_policies() -> None:
+def test_kl_of_gaussians_equals_kl_of_squashed_policies() -> None:
     pairs = zip(LOC[:2], SCALE[:2], strict=True)
     first, second = (TanhNormal(torch.tensor(loc), torch.tensor(scale)) for loc, scale in pairs)
     action = first.sample((100_000,))
@@ -204,14 +204,14 @@ def test_ended_episodes_share_one_absorbing_state(ended: list[bool], future: flo
     assert out["loss_metric"].item() == pytest.approx((5 - 0.5 * future) ** 2, rel=1e-4)
 
 
-def test_smooth_error_is_linear_where_it_is_large() -> None:
+def test_smooth_l1_is_linear_for_large_errors() -> None:
     loss = loss_of_tables(loss_function="smooth_l1", policy_weight=0.0)
     out = loss(transitions([0, 1], [1, 2], [2.0, 1.0], [False, False], 3))
     assert out["loss_metric"].item() == pytest.approx(5 - 1 - 0.5 * D12 - 0.5, rel=1e-4)
 
 
 @pytest.mark.parametrize(("reward", "left"), [(2.0, 3**0.5), (1.0, 0.0), (0.5, 0.0)])
-def test_corrected_difference_takes_the_variances_off(reward: float, left: float) -> None:
+def test_corrected_reward_difference_subtracts_the_variances(reward: float, left: float) -> None:
     # The members' variances at states 0 and 1 are 1 and 0.
     loss = loss_of_tables(reward_difference="corrected")
     out = loss(transitions([0, 1], [1, 2], [reward, 0.0], [False, False], 3))
@@ -225,7 +225,7 @@ def test_ensemble_loss_and_variance_by_hand() -> None:
     assert out["mean_reward_variance"].item() == pytest.approx((1 + 0 + 0.25) / 3)
 
 
-def test_members_learn_on_their_own_subsets_with_the_same_expected_loss() -> None:
+def test_random_subsets_keep_the_expected_ensemble_loss() -> None:
     count = 4_000
     data = transitions([0] * count, [1] * count, [1.0] * count, [False] * count, 3)
     whole = loss_of_tables(reduction="none")(data)["loss_reward_ensemble"]
@@ -236,7 +236,7 @@ def test_members_learn_on_their_own_subsets_with_the_same_expected_loss() -> Non
     assert (part == 4.0).float().mean().item() == pytest.approx(1 / 16, abs=0.02)
 
 
-def test_distances_on_a_cycle_come_to_the_fixed_point() -> None:
+def test_distances_on_a_cycle_converge_to_the_fixed_point() -> None:
     # 0 -> 1 -> 2 -> 0 with rewards 0, 1, 2; divergences 1/2, 1/2 and 0, the same both ways.
     actor = policy([[0.0], [1.0], [0.0]], [[1.0]] * 3)
     encoder = table(*(0.1 * torch.randn(3, 2)).tolist())
@@ -272,7 +272,7 @@ def test_policies_that_always_differ_by_c_are_c_over_one_minus_gamma_apart(
         assert out["loss_metric"].item() == pytest.approx(error, abs=1e-6)
 
 
-def test_ensemble_agrees_where_it_has_learned_and_nowhere_else() -> None:
+def test_ensemble_variance_is_low_only_on_trained_data() -> None:
     ensemble = RewardEnsemble(2, 1, hidden=(32,))
     actor = policy([[0.0]] * 2, [[1.0]] * 2)
     loss = EMELoss(StateEncoder(2, 2, hidden=(8,)), ensemble, actor)
@@ -318,6 +318,6 @@ def test_plain_networks_are_refused() -> None:
             EMELoss(*wrong)
 
 
-def test_one_transition_has_no_pairs() -> None:
+def test_batch_of_one_transition_is_refused() -> None:
     with pytest.raises(ValueError, match="at least two"):
         loss_of_tables()(transitions([0], [1], [0.0], [False], 3))

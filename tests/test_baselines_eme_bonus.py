@@ -126,7 +126,7 @@ def test_total_reward_is_the_tasks_plus_the_weighted_bonus(weight: float, total:
     assert data["next", "reward"].item() == 10.0
 
 
-def test_a_normalized_bonus_deviates_by_its_weight_in_deviations_of_the_reward() -> None:
+def test_normalized_bonus_has_weight_times_the_rewards_deviation() -> None:
     # Bonuses 5 and 4 sqrt(13), rewards 10 and 16 with a deviation of 3.
     transform = bonus_of_tables(weight=0.5, normalize=True)
     data = transform(steps([0, 1], [1, 2], [10.0, 16.0]))
@@ -138,7 +138,7 @@ def test_a_normalized_bonus_deviates_by_its_weight_in_deviations_of_the_reward()
     torch.testing.assert_close(added.std(correction=0), torch.tensor(0.5 * 3.0))
 
 
-def test_a_normalized_bonus_does_not_grow_with_the_metric() -> None:
+def test_normalized_bonus_is_independent_of_the_metrics_scale() -> None:
     added = []
     for scale in (1.0, 1000.0):
         transform = bonus_of_tables(normalize=True)
@@ -148,12 +148,12 @@ def test_a_normalized_bonus_does_not_grow_with_the_metric() -> None:
     torch.testing.assert_close(*added)
 
 
-def test_a_normalized_bonus_counts_where_no_step_was_ever_rewarded() -> None:
+def test_normalized_bonus_without_any_reward_has_unit_deviation() -> None:
     data = bonus_of_tables(normalize=True)(steps([0, 1], [1, 2], [0.0, 0.0]))
     assert data["next", "total_reward"].std(correction=0).item() == pytest.approx(1.0)
 
 
-def test_statistics_of_a_normalized_bonus_are_saved() -> None:
+def test_state_dict_includes_statistics_of_a_normalized_bonus() -> None:
     one, other = bonus_of_tables(normalize=True), bonus_of_tables(normalize=True)
     one(steps([0, 1], [1, 2], [10.0, 16.0]))
     other.load_state_dict(one.state_dict())
@@ -168,11 +168,11 @@ def test_time_dimensions() -> None:
     torch.testing.assert_close(bonus, torch.tensor([[[5.0], [4 * D12]]]))
 
 
-def test_a_state_that_does_not_change_earns_nothing() -> None:
+def test_bonus_is_zero_for_an_unchanged_state() -> None:
     assert bonus_of_tables()(steps([1], [1], [0.0]))["next", "intrinsic_reward"].item() < 1e-4
 
 
-def test_bonus_follows_the_loss_that_trains_its_networks() -> None:
+def test_bonus_uses_the_networks_that_the_loss_trains() -> None:
     encoder, ensemble = table(*ROWS), predictors(PREDICTIONS)
     loss = EMELoss(encoder, ensemble, policy(LOC, SCALE))
     SoftUpdate(loss, tau=0.1)

@@ -38,7 +38,7 @@ def covariance_of(actor: Any, data: TensorDict) -> Tensor:
     return lower @ lower.mT
 
 
-def test_actor_has_the_printed_covariance() -> None:
+def test_actor_has_the_papers_covariance() -> None:
     actor, data = actor_on(log_std_init=-1.0).double(), observations(5).double()
     network = actor[0].module
     features = network.features(data["observation"])
@@ -59,7 +59,7 @@ def test_actor_has_the_printed_covariance() -> None:
         (-3, 2 * math.exp(-6)),
     ],
 )
-def test_plain_spread_is_bounded_as_its_authors_bound_it(raw: float, variance: float) -> None:
+def test_plain_log_std_has_the_authors_bounds(raw: float, variance: float) -> None:
     actor = make_lattice_actor({"observation": 4}, SPEC, hidden=(8,))
     network = actor[0].module
     with torch.no_grad():
@@ -71,12 +71,12 @@ def test_plain_spread_is_bounded_as_its_authors_bound_it(raw: float, variance: f
     assert raw != 1.0 or round(variance, 2) == 14.78
 
 
-def test_state_dependent_spread_may_grow_to_ten_as_its_authors_have_it() -> None:
+def test_state_dependent_std_has_the_authors_bounds() -> None:
     spread = actor_on(state_dependent=True)[0].module.spread
     assert [round(math.exp(bound), 6) for bound in spread.bounds] == [0.001, 10.0]
 
 
-def test_state_dependent_actor_has_the_printed_covariance() -> None:
+def test_state_dependent_actor_has_the_papers_covariance() -> None:
     actor = actor_on(state_dependent=True, alpha=0.7, std_reg=0.1, log_std_bounds=(-3.0, 2.0))
     actor, data = actor.double(), observations(5).double()
     network = actor[0].module
@@ -92,7 +92,7 @@ def test_state_dependent_actor_has_the_printed_covariance() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_spread_starts_at_the_asked_value_and_stays_in_its_bounds(kind: dict[str, bool]) -> None:
+def test_log_std_starts_at_its_init_and_stays_in_its_bounds(kind: dict[str, bool]) -> None:
     actor = actor_on(**kind, log_std_init=-2.0, log_std_bounds=(-3.0, 0.0), std_reg=0.0)
     network = actor[0].module
     features = torch.ones(1, 6)
@@ -109,7 +109,7 @@ def test_spread_starts_at_the_asked_value_and_stays_in_its_bounds(kind: dict[str
 
 
 @pytest.mark.parametrize(("push", "sign"), [(100.0, 1), (-100.0, -1)])
-def test_a_spread_beyond_its_bounds_can_come_back(push: float, sign: int) -> None:
+def test_log_std_beyond_its_bounds_gets_a_gradient_inwards(push: float, sign: int) -> None:
     spread = StateDependentSpread(4, 2, init=0.0, bounds=(-3.0, 0.0), alpha=1.0, std_reg=0.0)
     with torch.no_grad():
         spread.log_std.add_(push)
@@ -130,7 +130,7 @@ def test_gradients_reach_every_part_of_the_actor(kind: dict[str, bool]) -> None:
             assert parameter.grad.abs().sum() > 0, name
 
 
-def test_log_prob_moves_w_through_the_covariance() -> None:
+def test_log_prob_reaches_the_last_layer_through_the_covariance() -> None:
     actor, data = actor_on(log_std_init=-1.0), observations(8)
     network = actor[0].module
     dist = actor.get_dist(data)
@@ -179,7 +179,7 @@ def test_state_dict_round_trip_gives_the_same_distribution(kind: dict[str, bool]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_follows_its_module_to_another_precision(kind: dict[str, bool]) -> None:
+def test_actor_follows_a_change_of_dtype(kind: dict[str, bool]) -> None:
     actor = actor_on(**kind).double()
     assert actor(observations(5).double())["action"].dtype == torch.float64
     assert actor.float()(observations(5))["action"].dtype == torch.float32

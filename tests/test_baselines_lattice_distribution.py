@@ -52,7 +52,7 @@ def test_every_row_has_its_own_covariance(rows: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("width", [1.0, 30.0, 1e4])
-def test_single_precision_survives_actuators_that_move_as_one(width: float) -> None:
+def test_float32_cholesky_succeeds_for_collinear_actuators(width: float) -> None:
     weight = width * torch.ones(80, 1) @ torch.rand(1, 256) + 1e-4 * torch.randn(80, 256)
     weight.requires_grad_()
     lower = lattice_scale_tril(weight, torch.rand(16, 256), torch.full((16, 80), 1e-6))
@@ -63,7 +63,7 @@ def test_single_precision_survives_actuators_that_move_as_one(width: float) -> N
     assert (scale < 1).all() and (scale > 0.2).all()  # mean variance of a feature: a half
 
 
-def test_gradients_reach_w_and_both_variances() -> None:
+def test_scale_tril_passes_gradcheck() -> None:
     leaves = [torch.randn(3, 6), torch.rand(4, 6) + 0.1, torch.rand(4, 3) + 0.1]
     leaves = [leaf.double().requires_grad_() for leaf in leaves]
     assert torch.autograd.gradcheck(lattice_scale_tril, leaves)
@@ -93,7 +93,7 @@ def test_density_integrates_to_one() -> None:
     torch.testing.assert_close(mass.item(), 1.0, rtol=1e-3, atol=0)
 
 
-def test_drawn_actions_are_scored_as_log_prob_scores_them() -> None:
+def test_rsample_and_log_prob_agrees_with_log_prob() -> None:
     loc, lower = gaussian()
     normal = LatticeNormal(loc, lower, low=LOW, high=HIGH)
     action, log_prob = normal.rsample_and_log_prob((100,))
@@ -101,7 +101,7 @@ def test_drawn_actions_are_scored_as_log_prob_scores_them() -> None:
     assert (action >= LOW).all() and (action <= HIGH).all()
 
 
-def test_gradient_of_a_drawn_score_is_that_of_log_prob_along_the_draw() -> None:
+def test_gradient_of_rsample_and_log_prob_equals_the_explicit_density() -> None:
     loc, lower = (leaf.requires_grad_() for leaf in gaussian(rows=1))
     normal = LatticeNormal(loc, lower)
     torch.manual_seed(1)
@@ -116,7 +116,7 @@ def test_gradient_of_a_drawn_score_is_that_of_log_prob_along_the_draw() -> None:
         torch.testing.assert_close(*((one.tril(), other.tril()) if one.ndim == 3 else (one, other)))
 
 
-def test_scores_are_finite_at_and_near_the_bounds() -> None:
+def test_log_prob_is_finite_at_and_near_the_bounds() -> None:
     loc = torch.tensor([[40.0, -40.0]], requires_grad=True)
     normal = LatticeNormal(loc, 1e-3 * torch.eye(2).expand(1, 2, 2))
     action, log_prob = normal.rsample_and_log_prob()

@@ -39,7 +39,7 @@ def test_noise_over_many_draws_has_the_actors_distribution() -> None:
     torch.testing.assert_close(latent.mean(0), dist.base_dist.loc[0], rtol=0, atol=0.03)
 
 
-def test_noise_is_the_printed_function_of_the_state() -> None:
+def test_noise_is_the_papers_function_of_the_features() -> None:
     policy, data = noisy(alpha=0.7), observations(2)
     with torch.no_grad():
         action = policy(data)["action"]
@@ -61,7 +61,7 @@ def test_rows_differ_and_keep_their_noise_for_freq_steps() -> None:
     assert changes == [keep, keep, change, keep, keep, change]
 
 
-def test_noise_is_drawn_anew_where_an_episode_begins_and_nowhere_else() -> None:
+def test_noise_is_redrawn_only_in_rows_whose_episode_begins() -> None:
     policy, data = noisy(freq=4), observations(3)
     policy.init_key = ("agent", "begins")
     first = policy(data.clone())["action"]
@@ -85,14 +85,14 @@ def test_no_noise_unless_exploring(kind: ExplorationType) -> None:
     assert torch.equal(policy(data.clone())["action"], loud)  # nor was any noise used up
 
 
-def test_replaces_the_independent_sample_when_run_after_the_actor() -> None:
+def test_held_noise_replaces_the_actors_sample() -> None:
     policy, data = noisy(), observations(3)
     both = TensorDictSequential(policy.actor, policy)
     one, other = both(data.clone())["action"], both(data.clone())["action"]
     assert torch.equal(one, other)
 
 
-def test_memory_is_in_neither_the_tensordict_nor_the_state_dict_nor_a_copy() -> None:
+def test_held_noise_is_not_written_saved_or_copied() -> None:
     policy, data = noisy(), observations(3)
     before = policy.state_dict().keys()
     written = policy(data.clone())
@@ -104,14 +104,14 @@ def test_memory_is_in_neither_the_tensordict_nor_the_state_dict_nor_a_copy() -> 
 
 
 @pytest.mark.parametrize("rows", [(), (3,), (2, 3)])
-def test_any_batch_shape_and_a_change_of_it_or_of_precision(rows: tuple[int, ...]) -> None:
+def test_batch_shape_and_dtype_may_change(rows: tuple[int, ...]) -> None:
     policy = noisy()
     assert policy(observations(7))["action"].shape == (7, 3)
     assert policy(observations(*rows))["action"].shape == (*rows, 3)
     assert policy.double()(observations(*rows).double())["action"].dtype == torch.float64
 
 
-def test_noise_leaves_no_graph_behind() -> None:
+def test_held_noise_keeps_no_autograd_graph() -> None:
     policy = noisy()
     for _ in range(5):
         policy.zero_grad()
@@ -119,7 +119,7 @@ def test_noise_leaves_no_graph_behind() -> None:
     assert not any(matrices.requires_grad for matrices in policy._matrices)
 
 
-def test_noise_refuses_other_actors_and_frequencies() -> None:
+def test_wrong_actors_and_frequencies_are_refused() -> None:
     with pytest.raises(TypeError, match="state_dependent=True"):
         LatticeNoise(make_actor({"observation": 4}, SPEC))
     with pytest.raises(TypeError, match="does not depend on the state"):
@@ -129,7 +129,7 @@ def test_noise_refuses_other_actors_and_frequencies() -> None:
 
 
 @pytest.mark.parametrize("make", [actor_on, noisy])
-def test_acts_on_bare_arrays_as_the_vector_collector_has_them(make: Any) -> None:
+def test_policy_on_arrays_matches_the_actor_and_explores(make: Any) -> None:
     policy, data = make(), observations(3)
     arrays = {"observation": data["observation"].numpy()}
     if "is_init" in policy.in_keys:

@@ -52,7 +52,7 @@ def test_similarity_is_the_cosine_of_scaled_lengths_averaged_over_chunks() -> No
         assert group_muscles(other, 2, chunk=2).tolist() == [0, 1, 0]
 
 
-def test_as_many_groups_as_muscles_and_only_one() -> None:
+def test_one_group_and_as_many_groups_as_muscles() -> None:
     assert group_muscles(planted(), 6).tolist() == [0, 1, 2, 3, 4, 5]
     assert group_muscles(planted(), 1).tolist() == [0] * 6
     assert group_muscles(planted(), 2).dtype == torch.long
@@ -125,7 +125,7 @@ class TwoHinges(gym.Env):
         return self.data.qpos.astype(np.float32), 0.0, False, self.steps == 7, {}
 
 
-def test_recording_throws_joints_about_and_holds_what_floats() -> None:
+def test_recording_draws_joint_velocities_and_holds_free_bodies() -> None:
     inner = TwoHinges()
     lengths = record_muscle_lengths(GymWrapper(inner), 40, amplitude=5.0, every=10, seed=1)
     velocities = np.stack(inner.velocities)
@@ -155,7 +155,7 @@ SLIDES = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0
 
 
 @pytest.mark.parametrize("joints", ["<freejoint/>", SLIDES, '<joint type="hinge" axis="0 1 0"/>'])
-def test_objects_stay_where_they_are_whatever_they_hang_on(joints: str) -> None:
+def test_recording_keeps_objects_in_place_on_any_joint_type(joints: str) -> None:
     inner = TwoHinges(OBJECT.format(joints=joints))
     colliding = inner.model.geom_contype.copy(), inner.model.geom_conaffinity.copy()
     record_muscle_lengths(GymWrapper(inner), 30, amplitude=50.0, every=3)
@@ -170,7 +170,7 @@ def test_objects_stay_where_they_are_whatever_they_hang_on(joints: str) -> None:
 @pytest.mark.parametrize(
     "task", ["myoHandKeyTurn", "myoHandPenTwirl", "myoBaoding", "myoDieReorient", "myoRelocate"]
 )
-def test_no_object_of_a_task_is_thrown_while_its_hand_is(task: str, monkeypatch: Any) -> None:
+def test_recording_moves_the_hand_and_not_the_object_of_a_task(task: str, monkeypatch: Any) -> None:
     env = make_env(task)
     env.reset()
     model, state = mujoco_state(env)

@@ -54,7 +54,7 @@ def by_hand(**kwargs: Any) -> SARDecoder:
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_decoding_is_scikit_learns_way_back(noise: float, seed: int) -> None:
+def test_decoding_equals_scikit_learns_inverse_transforms(noise: float, seed: int) -> None:
     actions, *_ = planted(noise=noise)
     decoder = SARDecoder.fit(actions, SYNERGIES, low=-9.0, high=9.0, blend=1.0, seed=seed)
     pca = PCA(SYNERGIES, random_state=seed)
@@ -94,7 +94,7 @@ def test_planted_actions_are_reconstructed_by_coefficients_in_the_box() -> None:
     torch.testing.assert_close(synergy.amin(0), -ones, atol=1e-6, rtol=0)
 
 
-def test_fitting_is_deterministic_keeps_dtype_and_leaves_generators_alone() -> None:
+def test_fitting_is_deterministic_keeps_dtype_and_leaves_the_rng_alone() -> None:
     actions = planted(noise=0.05)[0].float()
     before = torch.get_rng_state()
     one, other = (SARDecoder.fit(actions, SYNERGIES, seed=5) for _ in range(2))
@@ -149,7 +149,7 @@ def test_attributes_are_those_of_a_synergy_decoder() -> None:
     assert decoder.low.tolist() == [-1] * 3 and decoder.high.tolist() == [1] * 3
 
 
-def test_nothing_in_it_learns() -> None:
+def test_decoder_has_no_parameters() -> None:
     decoder = by_hand()
     assert not list(decoder.parameters())
     assert {name for name, _ in decoder.named_buffers()} == {
@@ -172,7 +172,7 @@ def test_state_dict_round_trip() -> None:
     assert torch.equal(other.low, one.low)
 
 
-def test_copies_and_sources_are_independent() -> None:
+def test_decoder_shares_no_memory_with_inputs_or_copies() -> None:
     mean, basis = torch.zeros(3), torch.ones(2, 3)
     decoder = SARDecoder(mean, basis)
     copied = copy.deepcopy(decoder)
@@ -182,7 +182,7 @@ def test_copies_and_sources_are_independent() -> None:
     assert (decoder.module.basis == 1).all()
 
 
-def test_no_device_is_cached() -> None:
+def test_spec_and_bounds_follow_the_device() -> None:
     decoder = by_hand().to("meta")
     assert decoder.synergy_spec.device.type == "meta" and decoder.low.is_meta
 
@@ -274,7 +274,7 @@ def test_composes_with_synergy_sac(blend: float) -> None:
         assert torch.equal(value, before[key]), key
 
 
-def test_the_decoder_loss_of_its_own_actions_is_zero() -> None:
+def test_decoder_loss_of_decoded_actions_is_zero() -> None:
     decoder = overactuated_decoder(0.66)
     synergy = decoder.synergy_spec.rand((8,))
     batch = TensorDict({"synergy": synergy, "action": decode(decoder, synergy)}, [8])
@@ -282,7 +282,7 @@ def test_the_decoder_loss_of_its_own_actions_is_zero() -> None:
 
 
 @pytest.mark.parametrize("blend", [1.0, 0.66])
-def test_the_learn_stage_learns_through_it(blend: float) -> None:
+def test_stage_2_trains_the_actor_and_keeps_the_sar_decoder(blend: float) -> None:
     decoder = overactuated_decoder(blend)
     overrides = ("run_dir=unused", "learn.decoder.fine_tuning=frozen")
     stage = Experiment(tiny(*overrides)).method.learn_stage(decoder)
@@ -316,7 +316,7 @@ def test_encode_inverts_decode_inside_the_bounds(blend: float) -> None:
     torch.testing.assert_close(found, synergy[:, :2], atol=1e-5, rtol=0)
 
 
-def test_log_slope_is_the_determinant_inside_the_bounds() -> None:
+def test_log_slope_is_the_log_determinant_inside_the_bounds() -> None:
     decoder = by_hand(blend=0.6)
     row = torch.tensor([0.2, -0.1, 0.3, 0.1, -0.2])
     found = torch.func.jacrev(decoder.module)(row)[:, 2:].slogdet().logabsdet

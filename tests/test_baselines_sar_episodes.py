@@ -29,7 +29,7 @@ def test_an_episode_at_the_percentile_is_not_above_it() -> None:
     assert best_episodes(actions, returns).unique().tolist() == [5]
 
 
-def test_each_episode_counts_once_where_they_are_told_apart() -> None:
+def test_percentile_is_over_episodes_when_their_numbers_are_given() -> None:
     # By steps the median is 3, the return of the longest; by episodes it is 2.5.
     actions, returns, episodes = rows_of([1.0, 2.0, 3.0, 4.0], [1, 1, 20, 1])
     assert best_episodes(actions, returns, percentile=50).unique().tolist() == [3]
@@ -37,7 +37,7 @@ def test_each_episode_counts_once_where_they_are_told_apart() -> None:
     assert kept.unique().tolist() == [2, 3]
 
 
-def test_where_none_is_above_the_highest_are_taken() -> None:
+def test_highest_returns_are_taken_if_none_is_above_the_percentile() -> None:
     actions, returns, _ = rows_of([1.0, 2, 2, 2], [2] * 4)
     assert best_episodes(actions, returns).unique().tolist() == [1, 2, 3]
 

@@ -30,13 +30,13 @@ def benchmarks() -> Iterator[SimpleNamespace]:
             sys.modules.pop(name)
 
 
-def test_the_tables_of_the_page_are_made_of_the_committed_lines(benchmarks):
+def test_tables_of_the_page_match_the_committed_results(benchmarks):
     bench = benchmarks.bench
     page = bench.PAGE.read_text(encoding="utf-8")
     assert bench.BEGIN + bench.table(bench.written()) + bench.END in page
 
 
-def test_lines_beside_peers_tell_processor_threads_load_and_versions(benchmarks):
+def test_results_with_peers_record_cpu_threads_load_and_versions(benchmarks):
     with_peers = benchmarks.bench.WITH_PEERS
     rows = [row for row in benchmarks.bench.written() if row["benchmark"] in with_peers]
     assert {row["benchmark"] for row in rows} == set(with_peers)
@@ -46,7 +46,7 @@ def test_lines_beside_peers_tell_processor_threads_load_and_versions(benchmarks)
         assert peers <= row["peer_versions"].keys()
 
 
-def test_peers_make_as_many_updates_a_frame_as_ours(benchmarks):
+def test_peers_update_after_whole_steps_of_all_environments(benchmarks):
     end_to_end = benchmarks.end_to_end
     for frames_per_update in end_to_end.FRAMES_PER_UPDATE:
         for peer, at_once in end_to_end.peer_cases(frames_per_update).values():
@@ -54,7 +54,7 @@ def test_peers_make_as_many_updates_a_frame_as_ours(benchmarks):
             assert frames_per_update * at_once % envs == 0  # whole steps of all environments
 
 
-def test_a_line_has_the_ratios_to_others_within_each_round(benchmarks, capsys):
+def test_result_has_ratios_to_peers_within_each_round(benchmarks, capsys):
     fast, slow = [1.0, 4.0, 3.0], [2.0, 8.0, 3.0]
     peers = {"slow": slow, "fast": fast}
     row = benchmarks.harness.line("update", "fast", "ms", fast, peers=peers, threads=1)
@@ -67,7 +67,7 @@ def test_a_line_has_the_ratios_to_others_within_each_round(benchmarks, capsys):
     ("flags", "expected"),
     [("fpu avx avx2 fma", (True, False, False, False)), ("avx2 amx_tile", (True, 0, 0, True))],
 )
-def test_a_line_tells_the_instructions_that_products_gain_from(
+def test_machine_facts_name_the_cpu_and_its_vector_instructions(
     flags, expected, benchmarks, tmp_path
 ):
     cpuinfo = tmp_path / "cpuinfo"
@@ -79,7 +79,7 @@ def test_a_line_tells_the_instructions_that_products_gain_from(
     assert not any(benchmarks.machine.machine(tmp_path / "none")["cpu_flags"].values())
 
 
-def test_the_floor_counts_the_products_of_a_perceptron(benchmarks):
+def test_floor_lists_the_matrix_products_of_an_mlp(benchmarks):
     products = benchmarks.floor.products(5, [2, 3, 1], "fwh")
     forward, weights = [(5, 2, 3), (5, 3, 1)], [(2, 5, 3), (3, 5, 1)]
     assert list(products) == [*forward, *weights, (5, 1, 3)]  # none to the input
@@ -115,7 +115,7 @@ def test_seeds_are_timed_as_training_updates_them_together(benchmarks, monkeypat
     assert min(values["together"] + values["one_by_one"]) > 0
 
 
-def test_a_python_without_peers_is_told_what_installs_them(benchmarks, tmp_path):
+def test_python_without_peers_is_refused_with_the_make_target(benchmarks, tmp_path):
     peer_python = benchmarks.peers.peer_python
     assert peer_python("none") is None
     with pytest.raises(SystemExit, match=r"not a Python that runs; `make .venv-peers/.complete`"):
@@ -129,7 +129,7 @@ def test_a_python_without_peers_is_told_what_installs_them(benchmarks, tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("library", ["stable_baselines3", "sbx"])
-def test_a_peer_answers_with_its_versions_and_milliseconds(library, benchmarks):
+def test_peer_prints_its_versions_and_milliseconds(library, benchmarks):
     try:
         python = benchmarks.peers.peer_python(benchmarks.peers.PYTHON)
     except SystemExit as error:

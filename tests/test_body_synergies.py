@@ -30,7 +30,7 @@ from torchrl_etl.training.context import Context
 TASK = "myoHandKeyTurn"
 
 
-def test_a_synergy_turns_its_joint_alone_and_its_strongest_muscle_changes_by_one():
+def test_each_synergy_turns_one_joint_with_a_largest_change_of_one():
     # Two opponents at the first joint, and a muscle over both joints.
     torques = np.array([[2.0, -2.0, 1.0], [0.0, 0.0, 3.0]])
     changes = muscle_changes(torques)
@@ -42,7 +42,7 @@ def test_a_synergy_turns_its_joint_alone_and_its_strongest_muscle_changes_by_one
     assert changes == pytest.approx(np.array([[1.0, -1.0, 0.0], [-0.25, 0.25, 1.0]]))
 
 
-def test_fewer_synergies_are_what_muscles_turn_most():
+def test_fewer_synergies_are_those_of_the_largest_torques():
     # The same two muscles turn the first two joints; a third turns the last.
     torques = np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 0.0], [0.0, 0.0, 9.0]])
     (change,) = muscle_changes(torques, 1)
@@ -51,7 +51,7 @@ def test_fewer_synergies_are_what_muscles_turn_most():
         muscle_changes(torques, 4)
 
 
-def test_the_decoder_rests_where_it_is_told_and_moves_joints():
+def test_body_decoder_rests_at_the_given_excitation_and_moves_joints():
     env = make_env(TASK, seed=0)
     env.reset()
     torques = joint_torques(env, num_postures=2).matrix
@@ -72,7 +72,7 @@ def study(name, *arguments):
     assert script(ROOT / "studies" / name, *map(str, arguments)) == 0
 
 
-def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_path):
+def test_studies_write_a_body_bundle_and_rows_of_joint_effects(tmp_path):
     study("body_synergies.py", TASK, tmp_path / "body", "--num-synergies", 5)
     decoder, info = load_bundle(tmp_path / "body")
     assert decoder.num_synergies == 5
@@ -106,7 +106,7 @@ def test_a_bundle_of_the_body_starts_stage_2_and_rows_say_what_turns_joints(tmp_
         assert 0 < float(row["shuffled_sd"]) < 0.2  # two dimensions scatter by 0.1
 
 
-def test_a_run_takes_the_synergies_of_its_body_and_goes_on_with_them(tmp_path):
+def test_run_with_body_synergies_saves_them_and_resumes(tmp_path):
     run = tmp_path / "run"
     made = tiny(f"env={TASK}", "method=etl_body", "learn.frames=192", f"run_dir={run}")
     made.num_synergies = None
@@ -124,7 +124,9 @@ def test_a_run_takes_the_synergies_of_its_body_and_goes_on_with_them(tmp_path):
 @pytest.mark.parametrize(
     ("env", "words"), [("overactuated", "MuJoCo"), ("humanoid-stand", "21 actuators, 0 of them")]
 )
-def test_a_body_without_muscles_has_no_synergies_of_its_own(env, words, tmp_path, monkeypatch):
+def test_body_synergies_without_muscles_are_refused_before_the_run(
+    env, words, tmp_path, monkeypatch
+):
     made, make_env = [], Context.make_env
 
     def remembered(self, **options):

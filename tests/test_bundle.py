@@ -92,13 +92,13 @@ def test_loads_from_the_run_folder_with_other_keys_and_residual(bundle):
     assert info.residual == 0.0
 
 
-def test_a_bundle_that_names_its_components_twice_loads_as_one_that_does_not(bundle):
+def test_redundant_num_components_of_an_older_bundle_is_ignored(bundle):
     _, info = load_bundle(bundle)
     edit(bundle, num_components=3)  # as all once did
     assert load_bundle(bundle)[1] == info
 
 
-def test_loading_leaves_the_global_seed_alone(bundle):
+def test_loading_leaves_the_global_rng_alone(bundle):
     state = torch.get_rng_state()
     load_bundle(bundle)
     assert torch.equal(torch.get_rng_state(), state)
@@ -136,7 +136,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("words", DAMAGE)
-def test_damage_is_named(bundle, words):
+def test_damaged_bundle_is_refused_with_the_cause(bundle, words):
     DAMAGE[words](bundle)
     with pytest.raises(BundleError, match=words):
         load_bundle(bundle)
@@ -159,7 +159,7 @@ def test_a_pickle_in_disguise_is_refused_without_running(bundle, tmp_path):
 
 @pytest.mark.parametrize("survives", [0, 1])
 @pytest.mark.parametrize("killed", [False, True], ids=["error", "killed"])
-def test_a_save_cut_short_leaves_the_old_bundle(bundle, monkeypatch, survives, killed):
+def test_interrupted_save_keeps_the_old_bundle(bundle, monkeypatch, survives, killed):
     """``survives`` moves succeed, then one fails; when killed, nothing after it runs either."""
     old, new = load_bundle(bundle)[0], fitted_decoder(seed=1)
     calls, replace = [], os.replace
@@ -183,7 +183,7 @@ def test_a_save_cut_short_leaves_the_old_bundle(bundle, monkeypatch, survives, k
     assert os.listdir(bundle.parent) == ["synergies"]
 
 
-def test_saving_refuses_to_sweep_away_other_files(bundle):
+def test_saving_refuses_to_overwrite_other_files(bundle):
     run = bundle.parent
     with pytest.raises(BundleError, match="holds 'synergies', and saving a bundle there would"):
         save(fitted_decoder(), run)
@@ -208,7 +208,7 @@ def test_saving_refuses_wrong_names_and_facts_that_json_cannot_hold(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_names_of_actuators_are_texts(tmp_path):
+def test_actuator_names_are_saved_as_strings(tmp_path):
     folder = save_bundle(fitted_decoder(), tmp_path / "b", task="toy", actuators=range(5))
     assert load_bundle(folder)[1].actuators == ("0", "1", "2", "3", "4")
 
@@ -265,7 +265,7 @@ def test_synergies_of_hand_pose_fit_the_other_hand_tasks_and_no_leg(tmp_path):
 
 
 @pytest.mark.parametrize("fault", [float("nan"), float("inf")])
-def test_a_decoder_that_is_not_finite_is_not_saved(fault, tmp_path):
+def test_saving_a_non_finite_decoder_is_refused(fault, tmp_path):
     decoder = SynergyDecoder(2, 3)
     with torch.no_grad():
         next(decoder.parameters()).view(-1)[0] = fault
@@ -274,7 +274,7 @@ def test_a_decoder_that_is_not_finite_is_not_saved(fault, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_bundle_of_a_decoder_that_is_not_finite_is_refused(tmp_path, monkeypatch):
+def test_loading_a_non_finite_decoder_is_refused(tmp_path, monkeypatch):
     decoder = SynergyDecoder(2, 3)
     with torch.no_grad():
         next(decoder.parameters()).view(-1)[0] = float("nan")
@@ -285,7 +285,7 @@ def test_a_bundle_of_a_decoder_that_is_not_finite_is_refused(tmp_path, monkeypat
         load_bundle(tmp_path / "own")
 
 
-def test_a_bundle_of_format_1_loads_and_says_that_it_cannot_encode(bundle):
+def test_format_1_bundle_loads_but_cannot_encode(bundle):
     new = load_bundle(bundle)[0]
     state = safetensors.torch.load_file(bundle / "synergies.safetensors")
     content = safetensors.torch.save(
@@ -301,7 +301,7 @@ def test_a_bundle_of_format_1_loads_and_says_that_it_cannot_encode(bundle):
         old.encode(actions(3))
 
 
-def test_the_encoder_is_kept_out_of_the_decoders_weights_and_follows_its_dtype(bundle):
+def test_encoder_is_not_in_the_decoders_state_dict_and_follows_its_dtype(bundle):
     decoder = load_bundle(bundle)[0]
     assert not any("encoder" in key for key in decoder.state_dict())
     assert not any(parameter.requires_grad for parameter in decoder.encoder.parameters())

@@ -18,14 +18,14 @@ from torchrl_etl.functional import categorical_mean, project_categorical
 SUPPORT = torch.linspace(-2.0, 2.0, 5)
 
 
-def test_an_atom_goes_to_its_neighbours_by_nearness_and_to_the_ends_beyond_them():
+def test_projection_splits_atoms_between_neighbors_and_clamps_at_the_ends():
     probabilities = torch.tensor([0.4, 0.3, 0.2, 0.1])
     atoms = torch.tensor([0.25, -7.0, 2.0, 1.0])
     by_hand = torch.tensor([0.3, 0.0, 0.4 * 0.75, 0.4 * 0.25 + 0.1, 0.2])
     torch.testing.assert_close(project_categorical(probabilities, atoms, SUPPORT), by_hand)
 
 
-def test_projection_keeps_the_mass_and_within_the_ends_the_mean():
+def test_projection_preserves_mass_and_mean_within_the_support():
     probabilities = softmax(torch.randn(3, 4, 7), -1)
     atoms = 4 * torch.rand(3, 4, 7) - 2
     projected = project_categorical(probabilities, atoms, SUPPORT)
@@ -56,7 +56,7 @@ def batch(size: int = 6) -> TensorDict:
     )
 
 
-def test_target_is_the_smaller_critics_distribution_moved_row_by_row():
+def test_target_is_the_projected_distribution_of_the_smaller_critic():
     torch.manual_seed(SEED)
     loss, data = make_loss(alpha_init=0.3), batch()
     SoftUpdate(loss, tau=0.5)
@@ -81,7 +81,7 @@ def test_target_is_the_smaller_critics_distribution_moved_row_by_row():
     assert target.requires_grad is False
 
 
-def test_critics_descend_to_the_target_and_the_actor_climbs_the_smaller_mean():
+def test_critics_learn_the_target_and_the_actor_the_smaller_mean():
     torch.manual_seed(SEED)
     loss, data = make_loss(fixed_alpha=True, alpha_init=1e-6), batch(64)
     SoftUpdate(loss, tau=0.5)
@@ -106,6 +106,6 @@ def test_critics_descend_to_the_target_and_the_actor_climbs_the_smaller_mean():
 
 
 @pytest.mark.parametrize("support", [torch.zeros(3), torch.tensor([0.0, 1.0, 3.0]), torch.eye(2)])
-def test_a_support_that_is_none_is_refused(support):
+def test_uneven_or_unordered_support_is_refused(support):
     with pytest.raises(ValueError, match="evenly spaced and ascending"):
         make_loss(support=support)

@@ -43,7 +43,7 @@ def start():
     assert not multiprocessing.active_children()
 
 
-def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(start):
+def test_next_synchronous_batch_uses_the_pushed_weights(start):
     collector, policy = start(sync=True, collector_class=VectorCollector)
     batches = iter(collector)
     batch = next(batches)
@@ -53,7 +53,7 @@ def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(
     assert_each_push_is_in_the_next_batch(collector, policy, batches)
 
 
-def test_asynchronous_workers_take_turns_and_only_batches_under_way_have_older_weights(start):
+def test_only_asynchronous_batches_under_way_have_older_weights(start):
     collector, policy = start(sync=False)
     batches = iter(collector)
     seen = [next(batches)]
@@ -73,7 +73,7 @@ def test_asynchronous_workers_take_turns_and_only_batches_under_way_have_older_w
 
 
 @pytest.mark.parametrize("sync", [True, False])
-def test_a_killed_worker_ends_the_run_with_a_message_that_names_it(start, sync):
+def test_killed_worker_ends_the_run_and_is_named(start, sync):
     collector, _ = start(sync=sync)
     batches = iter(collector)
     next(batches)
@@ -88,7 +88,7 @@ def test_a_killed_worker_ends_the_run_with_a_message_that_names_it(start, sync):
     assert time.monotonic() - began < 1
 
 
-def test_a_worker_that_does_not_answer_ends_the_run_too(start):
+def test_unresponsive_worker_ends_the_run(start):
     collector, _ = start(sync=False)
     batches = iter(collector)
     next(batches)
@@ -99,7 +99,7 @@ def test_a_worker_that_does_not_answer_ends_the_run_too(start):
             next(batches)
 
 
-def test_a_worker_that_stops_before_a_push_ends_the_run_too(start):
+def test_worker_that_stops_before_taking_weights_ends_the_run(start):
     collector, _ = start(sync=True, timeout=30.0)
     batches = iter(collector)
     next(batches)
@@ -125,7 +125,7 @@ def test_a_worker_that_cannot_start_is_reported_in_time(start):
     assert time.monotonic() - began < 40
 
 
-def test_workers_end_at_once_and_the_group_is_gone(start):
+def test_shutdown_ends_workers_and_the_process_group(start):
     collector, _ = start(total_frames=48)
     assert sum(batch.numel() for batch in collector) == collector.collected_frames == 48
     began = time.monotonic()

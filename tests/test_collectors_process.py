@@ -64,7 +64,7 @@ def observations(batches, count: int = 3) -> torch.Tensor:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ahead", [False, True])
-def test_a_process_collects_what_this_one_would(start, ahead):
+def test_worker_process_collects_the_same_frames_as_this_process(start, ahead):
     here, there = start("single"), start("process", ahead=ahead)
     for batches in (here, there):
         batches.restart(seed=5)
@@ -77,7 +77,7 @@ def test_a_process_collects_what_this_one_would(start, ahead):
 
 
 @pytest.mark.slow
-def test_the_next_batch_that_is_asked_for_decodes_with_the_newest_decoder(start, policy):
+def test_next_requested_batch_uses_the_newest_decoder(start, policy):
     in_turns, ahead = start("process"), start("process", ahead=True)
     for batches in (in_turns, ahead):
         batches.restart(seed=0)
@@ -90,7 +90,7 @@ def test_the_next_batch_that_is_asked_for_decodes_with_the_newest_decoder(start,
 
 
 @pytest.mark.slow
-def test_a_batch_is_collected_from_when_it_was_asked_for_on(start, policy):
+def test_batch_uses_the_weights_of_its_request(start, policy):
     batches = start("process")
     batches.restart(seed=0)
     batches.ask()
@@ -101,7 +101,7 @@ def test_a_batch_is_collected_from_when_it_was_asked_for_on(start, policy):
 
 
 @pytest.mark.slow
-def test_an_optimizer_step_does_not_reach_a_rollout_unasked(start, policy):
+def test_weight_changes_do_not_reach_a_batch_under_way(start, policy):
     batches = start("process", ahead=True)
     batches.restart(seed=1)
     observations(batches, 1)
@@ -122,7 +122,7 @@ def test_async_workers_take_new_weights(start, policy):
 
 
 @pytest.mark.slow
-def test_the_number_of_an_episode_tells_which_return_a_batch_of_any_worker_goes_on_with(start):
+def test_episode_numbers_identify_returns_across_workers(start):
     batches = start("async", num_workers=2, frames_per_batch=4 * 7)  # episodes end within batches
     returns: dict[int, float] = {}
     for _ in range(12):
@@ -138,7 +138,7 @@ def test_the_number_of_an_episode_tells_which_return_a_batch_of_any_worker_goes_
 
 
 @pytest.mark.slow
-def test_workers_do_not_repeat_each_other(start):
+def test_workers_collect_different_data(start):
     batches = start("process", num_workers=2, frames_per_batch=2 * FRAMES)
     batches.restart(seed=2)
     first, second = batches.next()
@@ -148,7 +148,7 @@ def test_workers_do_not_repeat_each_other(start):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["process", "async"])
-def test_a_killed_worker_ends_in_a_message_soon(start, kind):
+def test_killed_worker_ends_collection_with_a_message(start, kind):
     batches = start(kind, num_workers=2, frames_per_batch=2 * FRAMES)
     batches.next()
     os.kill(batches._collector.procs[1].pid, signal.SIGKILL)
@@ -173,7 +173,7 @@ def make_stuck() -> TransformedEnv:
 
 
 @pytest.mark.slow
-def test_a_hanging_worker_is_not_waited_for_without_end():
+def test_hanging_worker_times_out():
     actor = make_actor({"observation": 3}, PointTaskSpec, hidden=(8,))
     batches = make_batches("process", make_stuck, actor, frames_per_batch=8)
     batches.await_start()
@@ -240,7 +240,7 @@ class Gathered:
         pass
 
 
-def test_the_workers_of_several_collectors_start_at_once():
+def test_collectors_start_their_workers_in_parallel():
     there = threading.Barrier(2)
     several = [Batches(partial(Gathered, there)) for _ in range(2)]
     for batches in several:
@@ -253,7 +253,7 @@ def never_there():
     raise RuntimeError("no simulator")
 
 
-def test_a_start_that_fails_is_told_to_whoever_waits_for_it_and_can_be_closed():
+def test_failed_start_raises_in_await_start_and_can_be_closed():
     batches = Batches(never_there)
     with pytest.raises(CollectionError, match="did not start: no simulator"):
         batches.await_start()
@@ -266,7 +266,7 @@ def test_single_cannot_run_ahead():
         Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)
 
 
-def test_the_learner_keeps_its_threads_and_who_asks_the_workers_has_one(monkeypatch):
+def test_learner_keeps_its_thread_count_and_workers_start_with_one(monkeypatch):
     calls, set_num_threads = [], torch.set_num_threads
     monkeypatch.setattr(
         torch, "set_num_threads", lambda count: calls.append(count) or set_num_threads(count)

@@ -63,7 +63,7 @@ def pid(collector: RayWorkers, worker: int) -> int:
     return inside(collector, worker, lambda _: os.getpid())
 
 
-def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(start):
+def test_next_synchronous_batch_uses_the_pushed_weights(start):
     collector, policy = start(sync=True, collector_class=VectorCollector)
     nodes = [inside(collector, i, lambda _: ray.get_runtime_context().node_id) for i in range(2)]
     assert len(set(nodes)) == 2
@@ -82,7 +82,7 @@ def test_the_next_synchronous_batch_has_the_pushed_weights_of_actor_and_decoder(
     assert (next(iter(again))["observation"][0] == observation[0]).all()
 
 
-def test_asynchronous_batches_under_way_at_a_push_are_the_only_ones_with_older_weights(start):
+def test_only_asynchronous_batches_under_way_have_older_weights(start):
     collector, policy = start(sync=False)
     batches = iter(collector)
     next(batches)
@@ -100,9 +100,7 @@ def test_asynchronous_batches_under_way_at_a_push_are_the_only_ones_with_older_w
 
 
 @pytest.mark.parametrize("sync", [True, False])
-def test_a_killed_worker_is_replaced_by_one_with_the_newest_weights_and_no_frame_counts_twice(
-    start, sync
-):
+def test_replacement_of_a_killed_worker_has_the_newest_weights(start, sync):
     collector, policy = start(sync=sync, replacements=1)
     batches = iter(collector)
     seen = [next(batches)]
@@ -127,7 +125,7 @@ def test_a_killed_worker_is_replaced_by_one_with_the_newest_weights_and_no_frame
     assert not collector.remote_collectors
 
 
-def test_a_worker_that_does_not_answer_counts_as_lost(start):
+def test_unresponsive_worker_counts_as_lost(start):
     collector, _ = start(sync=True, replacements=0)
     batches = iter(collector)
     next(batches)
@@ -157,7 +155,7 @@ def test_workers_that_cannot_start_are_reported_in_time(start):
         start(num_workers=3, timeout=8.0)
 
 
-def test_a_local_ray_is_started_without_an_address_and_ended_with_the_collector():
+def test_without_an_address_a_local_ray_is_started_and_shut_down():
     collector = RayWorkers(make_batched_env, synergy_policy(), num_workers=1, frames_per_batch=8)
     worker = pid(collector, 0)
     assert next(iter(collector)).shape == (2, 4)

@@ -93,7 +93,7 @@ def assert_same(ours, theirs) -> None:
 
 @pytest.mark.parametrize("mode", ["explore", "policy", "transform"])
 @pytest.mark.parametrize("name", ["overactuated", "InvertedPendulum-v5"])
-def test_transitions_are_bit_by_bit_those_of_torchrl(name, mode):
+def test_transitions_equal_torchrls_bit_for_bit(name, mode):
     make, policy = parts(name, mode)
     ours = batches(VectorCollector, make, policy)
     theirs = batches(Collector, make, policy, **PLAIN)
@@ -106,7 +106,7 @@ def test_transitions_are_bit_by_bit_those_of_torchrl(name, mode):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["myoHandPenTwirl", "dog-run"])
-def test_real_simulators_too(name):
+def test_transitions_of_real_simulators_equal_torchrls(name):
     make, policy = parts(name, "explore", num_envs=2)
     assert_same(
         batches(VectorCollector, make, policy, frames=120),
@@ -114,7 +114,7 @@ def test_real_simulators_too(name):
     )
 
 
-def test_held_noise_is_the_same_under_both_and_begins_anew_with_every_episode():
+def test_held_noise_equals_torchrls_and_is_init_follows_done():
     _, policy = parts("overactuated", "policy")
 
     held = TensorDictSequential(HeldNoise(policy[0]), policy[1])
@@ -126,7 +126,7 @@ def test_held_noise_is_the_same_under_both_and_begins_anew_with_every_episode():
     assert begins[:, 0].all() and torch.equal(begins[:, 1:], ends[:, :-1]) and ends.any()
 
 
-def test_resets_of_single_environments_keep_the_others():
+def test_partial_resets_equal_torchrls():
     def make():
         return TransformedEnv(vectorized_point(), RewardSum())
 
@@ -148,12 +148,12 @@ def both_ways(make_policy, change=lambda _: None):
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_policy_of_which_a_graph_would_miss_something_acts_as_under_torchrl(name):
+def test_policy_that_cannot_be_traced_acts_as_under_torchrl(name):
     assert_same(*both_ways(MAKERS[name]))
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_whatever_is_changed_between_batches_shows_in_the_next(name):
+def test_change_of_the_policy_between_batches_takes_effect(name):
     ours, theirs = both_ways(*CHANGES[name])
     assert_same(ours, theirs)
     assert not torch.equal(ours[0]["action"], ours[1]["action"])
@@ -166,7 +166,7 @@ def test_without_a_policy_actions_are_random_as_under_torchrl():
 
 
 @pytest.mark.parametrize("mode", ["explore", "policy", "transform"])
-def test_policies_of_the_package_are_traced_once_and_without_a_word(mode):
+def test_package_policies_are_traced_once_without_warnings(mode):
     make, policy = parts("overactuated", mode)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
@@ -182,12 +182,12 @@ def test_policies_of_the_package_are_traced_once_and_without_a_word(mode):
     collector.shutdown()
 
 
-def test_what_keeps_a_policy_from_being_traced_is_told():
+def test_untraceable_policy_warns_with_the_reason():
     with pytest.warns(UserWarning, match=r"a graph may miss what Odd does \(hooks, branches"):
         VectorCollector(tracked, MAKERS["Python in forward"](), frames_per_batch=12).shutdown()
 
 
-def test_a_policy_that_is_not_a_plain_sequence_is_called_as_it_is():
+def test_policy_with_an_overridden_forward_acts_as_under_torchrl():
     class Doubled(TensorDictModule):
         def forward(self, tensordict):
             out = super().forward(tensordict)
@@ -200,7 +200,7 @@ def test_a_policy_that_is_not_a_plain_sequence_is_called_as_it_is():
     assert ours[0]["action"].abs().max() <= 0.5
 
 
-def test_collection_depends_on_nothing_else_in_the_process_and_disturbs_nothing():
+def test_collection_and_process_rngs_do_not_affect_each_other():
     make, policy = parts("overactuated", "explore")
     collector = VectorCollector(make, policy, frames_per_batch=96, total_frames=-1)
     iterator = iter(collector)
@@ -220,7 +220,7 @@ def test_collection_depends_on_nothing_else_in_the_process_and_disturbs_nothing(
     collector.shutdown()
 
 
-def test_weights_are_never_stale_whether_changed_in_place_or_replaced():
+def test_weights_changed_in_place_or_replaced_take_effect():
     make, policy = parts("overactuated", "policy")
     last = policy.module[1].module.decoder.mlp[-1]
     collector = VectorCollector(make, policy, frames_per_batch=12, total_frames=-1)
@@ -255,7 +255,7 @@ def test_the_exploration_type_is_obeyed():
     collector.shutdown()
 
 
-def test_random_frames_come_first_if_asked_for():
+def test_init_random_frames_are_collected_first():
     make, policy = parts("overactuated", "policy")
     with torch.no_grad():
         policy.module[1].module.decoder.mlp[-1].bias.fill_(20.0)
@@ -267,7 +267,7 @@ def test_random_frames_come_first_if_asked_for():
     assert second["action"].min() > 0.9
 
 
-def test_two_transforms_of_one_class_both_take_their_steps():
+def test_two_transforms_of_one_class_both_apply():
     make, policy = parts("overactuated", "explore")
 
     def twice() -> TransformedEnv:
@@ -300,7 +300,7 @@ class Pays(Transform):
         """An effort is none of the root's."""
 
 
-def test_reward_sum_sums_what_it_names_as_its_place_among_transforms_has_it():
+def test_reward_sum_respects_its_keys_and_the_order_of_transforms():
     make, policy = parts("overactuated", "policy")
 
     def paid(*transforms: Transform) -> TransformedEnv:
@@ -323,13 +323,13 @@ def test_reward_sum_sums_what_it_names_as_its_place_among_transforms_has_it():
         ("compact_obs", True),
     ],
 )
-def test_what_it_does_not_take_is_refused_by_its_name(name, value):
+def test_unsupported_arguments_are_refused_by_name(name, value):
     make, policy = parts("overactuated", "policy")
     with pytest.raises(ValueError, match=f"takes no {name}; leave it out, or use torchrl"):
         VectorCollector(make, policy, frames_per_batch=12, **{name: value})
 
 
-def test_an_environment_that_it_does_not_know_is_refused():
+def test_unsupported_environments_are_refused():
     make, policy = parts("overactuated", "policy")
     with pytest.raises(ValueError, match="has 2 RewardSum and VectorCollector takes one"):
         VectorCollector(lambda: make().append_transform(RewardSum()), policy, frames_per_batch=12)
@@ -340,7 +340,7 @@ def test_an_environment_that_it_does_not_know_is_refused():
 
 
 @pytest.mark.parametrize("kind", [VectorCollector, Collector])
-def test_a_reset_leaves_the_buffers_that_a_policy_writes_as_they_are(kind):
+def test_reset_keeps_the_buffers_of_the_policy(kind):
     env = make_env("overactuated", num_envs=2, seed=0)
     spec = env.full_action_spec_unbatched["action"]
     actor = make_dynsyn_actor({"observation": 6}, spec, [0, 1, 2, 3] * 4, hidden=(8,))

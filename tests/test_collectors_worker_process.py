@@ -26,7 +26,7 @@ del lock
 
 
 @pytest.mark.parametrize("name", ["SIGUSR1", "SIGHUP", "SIGTERM", "SIGINT"])
-def test_a_stop_signal_to_all_processes_leaves_the_resource_tracker_alone(name):
+def test_resource_tracker_survives_signals_to_the_process_group(name):
     command = [sys.executable, "-c", LOCKS_AND_A_SIGNAL, worker_process.__file__, name]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert not done.stderr

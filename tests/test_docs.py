@@ -75,7 +75,7 @@ def commands(page: Path) -> list[tuple[str, list[str]]]:
     [page for page in PAGES if commands(page) and name_of(page) != "docs/extend.md"],
     ids=name_of,
 )
-def test_commands_are_composed_by_their_recipe(page, tmp_path, monkeypatch, capsys):
+def test_commands_are_accepted_by_their_recipe(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for recipe, arguments in commands(page):
         told = " ".join([recipe, *arguments])
@@ -102,13 +102,13 @@ def test_commands_are_composed_by_their_recipe(page, tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())
-def test_what_is_left_out_here_is_run_elsewhere(page, test):
+def test_pages_not_run_here_are_named_in_their_own_test(page, test):
     assert BLOCK.search((ROOT / page).read_text(encoding="utf-8"))
     assert Path(page).name in (ROOT / test).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_relative_links_point_at_something(page):
+def test_relative_links_resolve(page):
     broken = []
     for link in LINK.findall(page.read_text(encoding="utf-8")):
         if re.match(r"[a-z]+:", link):
@@ -132,7 +132,7 @@ def cards(tasks_page) -> list[str]:
 
 
 @pytest.mark.parametrize("task", list_tasks(), ids=lambda task: task.name)
-def test_the_gallery_has_a_clip_the_actuators_and_the_command_of_a_task(task, cards, tasks_page):
+def test_gallery_has_clip_actuators_and_command_of_each_task(task, cards, tasks_page):
     (card,) = (card for card in cards if f"**{task.name}**" in card)
     actuators = re.search(rf"^\| {task.name} \| `[^`]+` \| (\d+) \|", tasks_page, re.MULTILINE)[1]
     assert f"](pictures/tasks/{task.name}.webp)" in card
@@ -140,7 +140,7 @@ def test_the_gallery_has_a_clip_the_actuators_and_the_command_of_a_task(task, ca
     assert f"    python recipes/etl_sac.py env={task.name}\n" in card
 
 
-def test_the_gallery_shows_each_trained_policy_of_the_zoo_that_has_a_body(cards):
+def test_gallery_shows_each_trained_zoo_policy_with_a_body(cards):
     trained = {name: zoo.read_card(name).task["name"] for name in zoo.names(trained=True)}
     drawn = [name for name, task in trained.items() if resolve_task(task).suite != "gymnasium"]
     for name in drawn:
@@ -148,14 +148,14 @@ def test_the_gallery_shows_each_trained_policy_of_the_zoo_that_has_a_body(cards)
         assert "](zoo.md)" in card and f"zoo={name}\n" in card
 
 
-def test_the_clips_of_the_gallery_are_small(cards):
+def test_gallery_clips_are_all_used_and_small(cards):
     clips = list((ROOT / "docs" / "pictures" / "tasks").iterdir())
     sizes = {clip.name: clip.stat().st_size for clip in clips}
     assert sorted(sizes) == sorted(re.findall(r"tasks/([\w-]+\.webp)", "".join(cards)))
     assert max(sizes.values()) <= 80_000 and sum(sizes.values()) <= 1_300_000
 
 
-def test_the_table_of_layers_is_the_contract_on_imports():
+def test_table_of_layers_matches_the_import_contract():
     contract = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
     layers = [layer.split(" | ") for layer in contract["contracts"][0]["layers"]]
     text = (ROOT / "docs" / "architecture.md").read_text("utf-8").partition("## Layers")[2]

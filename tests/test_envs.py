@@ -43,7 +43,7 @@ def some_actions(env, steps):
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 @pytest.mark.parametrize("name", TASKS)
-def test_specs_hold(name, num_envs):
+def test_env_specs_are_valid(name, num_envs):
     env = make_env(name, num_envs=num_envs, seed=0)
     check_env_specs(env, seed=0)
     td = env.rand_step(env.reset())
@@ -74,7 +74,7 @@ def test_bounds_are_the_simulators(name, low, actuators):
 @pytest.mark.parametrize(
     "name", ["myoHandPose", "myoHandPenTwirl", "humanoid-stand", "overactuated"]
 )
-def test_used_then_reseeded_equals_fresh(name, num_envs):
+def test_reseeded_env_equals_a_fresh_one(name, num_envs):
     goal = "fixed" if name == "humanoid-stand" else "random"
     used = make_env(name, num_envs=num_envs, goal=goal, seed=1)
     actions = some_actions(used, 15)
@@ -102,13 +102,13 @@ def test_every_paper_task_builds_as_listed_and_reseeds_exactly(name):
     assert len(actuator_names(used)) == used.action_spec.shape[-1]
 
 
-def test_seed_argument_is_set_seed():
+def test_seed_argument_equals_set_seed():
     first, second = make_env("overactuated", seed=5), make_env("overactuated")
     second.set_seed(5)
     assert torch.equal(first.reset()["observation"], second.reset()["observation"])
 
 
-def test_each_copy_has_its_own_seed_and_the_first_repeats_a_single_env():
+def test_batched_envs_have_distinct_seeds_the_first_that_of_a_single_env():
     single = make_env("myoHandPose", goal="random", seed=4).reset()
     batch = make_env("myoHandPose", goal="random", num_envs=3, seed=4).reset()
     later = make_env("myoHandPose", goal="random", num_envs=3, seed=5).reset()
@@ -137,7 +137,7 @@ def test_pen_twirl_truncates_at_its_limit_and_terminates_on_a_drop(excitation, l
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_a_repeated_action_adds_up_its_rewards_within_the_episode(num_envs):
+def test_action_repeat_sums_rewards_within_the_episode(num_envs):
     """Each step pays 1, is solved from the second on, and the limit is four of the simulator's."""
     env = make_env(PLANTED, num_envs=num_envs, action_repeat=3, seed=0)
     check_env_specs(env, seed=0)
@@ -149,7 +149,7 @@ def test_a_repeated_action_adds_up_its_rewards_within_the_episode(num_envs):
         assert following["truncated"].flatten().tolist() == [False, True]
 
 
-def test_a_repeated_action_is_the_same_action_twice():
+def test_action_repeat_equals_repeating_the_action():
     once, twice = make_env("myoHandPose", seed=0), make_env("myoHandPose", action_repeat=2, seed=0)
     actions = some_actions(once, 4)
     single = replay(once, 5, [action for action in actions for _ in range(2)])
@@ -186,7 +186,7 @@ def test_batched_reset_takes_a_tensordict_without_mask():
     assert td["observation"].shape == (2, 6)
 
 
-def test_names_come_from_torchrl_s_own_dm_control_and_not_from_workers():
+def test_actuator_names_of_torchrls_dm_control_env_but_not_of_workers():
     reacher = DMControlEnv("reacher", "easy")
     assert actuator_names(reacher) == ["shoulder", "wrist"]
     with pytest.raises(ValueError, match="A SerialEnv has its simulators in workers; pass the"):
@@ -204,7 +204,7 @@ def test_a_wrong_number_of_envs_is_refused(num_envs):
         make_env("overactuated", num_envs=num_envs)
 
 
-def test_a_wrong_number_of_repetitions_is_refused():
+def test_wrong_action_repeat_is_refused():
     with pytest.raises(ValueError, match="action_repeat is 0; it must be a whole number"):
         make_env("overactuated", action_repeat=0)
     with pytest.raises(ValueError, match=r"action_repeat is 26, but .* has 25 steps"):
@@ -234,7 +234,7 @@ def _pen():
 
 
 @pytest.mark.slow
-def test_worker_processes_register_for_themselves():
+def test_spawned_workers_register_the_task():
     env = ParallelEnv(2, _pen, mp_start_method="spawn")
     try:
         assert env.rollout(2)["next", "solved"].shape == (2, 2, 1)

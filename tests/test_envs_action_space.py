@@ -71,22 +71,22 @@ def test_actions_of_any_shape_are_flat_actuators(shape, num_envs):
         (spaces.Box(0, 5, (2,), np.int64), "actions are a Box of real numbers"),
     ],
 )
-def test_actions_without_synergies_are_refused_in_one_sentence(space, words):
+def test_unusable_action_spaces_are_refused_in_one_sentence(space, words):
     with pytest.raises(ValueError, match=words) as caught:
         taking(space)
     assert TAKES in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_the_widest_bounds_that_are_bounds_are_taken():
+def test_bounds_of_a_million_are_accepted():
     assert taking(box([-1e6], [1e6])).action_spec.space.high.item() == 1e6
 
 
-def test_motors_of_dm_control_without_limits_are_refused():
+def test_unbounded_dm_control_motors_are_refused():
     with pytest.raises(ValueError, match="lqr-lqr_2_1: actuator 0 of 1 has no bounds"):
         make_env("lqr-lqr_2_1")
 
 
-def test_the_cure_that_the_refusal_names_works():
+def test_unbounded_env_is_accepted_with_transform_action():
     def bounded():
         space = spaces.Box(-1, 1, (2,))
         inner = Takes(spaces.Box(-np.inf, np.inf, (2,)))

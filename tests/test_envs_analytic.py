@@ -50,7 +50,7 @@ def test_actions_outside_the_subspace_move_nothing():
     np.testing.assert_allclose(end[:2], start[:2], atol=1e-6)
 
 
-def test_the_subspace_solves_it_and_noise_does_not():
+def test_actions_in_the_subspace_solve_the_task_and_noise_does_not():
     env = AnalyticOveractuated(goal="random")
     matrix = env.muscle_matrix
     rng = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def test_the_subspace_solves_it_and_noise_does_not():
     assert np.mean([play(env, noise, seed)[1] for seed in seeds]) < 0.1
 
 
-def test_map_is_drawn_from_its_own_seed():
+def test_muscle_matrix_depends_on_matrix_seed_only():
     first, again = AnalyticOveractuated(matrix_seed=1), AnalyticOveractuated(matrix_seed=1)
     other = AnalyticOveractuated(matrix_seed=2)
     first.reset(seed=3)
@@ -76,7 +76,7 @@ def test_map_is_drawn_from_its_own_seed():
     assert not np.allclose(first.muscle_matrix, other.muscle_matrix)
 
 
-def test_goals():
+def test_fixed_goal_is_constant_and_random_goal_varies():
     fixed, moving = (
         make_env("overactuated", seed=0),
         make_env("overactuated", goal="random", seed=0),

@@ -27,26 +27,26 @@ gym.register("torchrl_etl_test/Forgiving-v0", entry_point=Forgiving, max_episode
 FORGIVING = "torchrl_etl_test/Forgiving-v0"
 
 
-def test_arguments_that_a_constructor_names_or_looks_up_reach_it():
+def test_arguments_in_the_signature_or_popped_from_kwargs_are_passed():
     env = make_env(FORGIVING, env_kwargs={"stiffness": 0.5, "recipe": "a"})
     assert env.reset()["observation"].item() == 0.5
 
 
-def test_an_argument_of_gymnasium_s_own_reaches_it():
+def test_arguments_of_gymnasium_are_accepted():
     assert make_env(FORGIVING, env_kwargs={"max_episode_steps": 7}).reset() is not None
 
 
-def test_an_argument_that_is_ignored_is_refused_with_the_nearest_known():
+def test_ignored_argument_is_refused_with_the_nearest_known_name():
     with pytest.raises(ValueError, match=r"ignores env_kwargs\.stifness.*they know stiffness"):
         make_env(FORGIVING, env_kwargs={"stifness": 0.5})
 
 
-def test_myosuite_s_own_arguments_reach_it_and_others_are_refused():
+def test_arguments_of_myosuite_are_accepted_and_unknown_ones_refused():
     make_env("myoHandKeyTurn", env_kwargs={"frame_skip": 5, "goal_th": 1.0}).close()
     with pytest.raises(ValueError, match=r"myoHandKeyTurn ignores env_kwargs\.nonsense"):
         make_env("myoHandKeyTurn", env_kwargs={"nonsense": 3})
 
 
-def test_dm_control_refuses_by_itself():
+def test_dm_control_tasks_refuse_env_kwargs():
     with pytest.raises(ValueError, match="does not take env_kwargs"):
         make_env("cartpole-swingup", env_kwargs={"nonsense": 3})

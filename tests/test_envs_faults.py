@@ -17,7 +17,7 @@ from torchrl_etl.envs import SimulationError, make_env
         ("reward", "reward is not finite at step 3 of episode 1 (since seed 9)"),
     ],
 )
-def test_a_fault_stops_the_run_and_says_where(fault, says, num_envs):
+def test_non_finite_numbers_stop_the_run_and_say_where(fault, says, num_envs):
     env = make_env(PLANTED, num_envs=num_envs, env_kwargs={"fault": fault})
     with pytest.raises(SimulationError) as caught:
         env.rollout(4, auto_reset=False, tensordict=env.reset(seed=9))
@@ -25,7 +25,7 @@ def test_a_fault_stops_the_run_and_says_where(fault, says, num_envs):
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_an_observation_of_another_size_than_its_space_is_one_sentence(num_envs, monkeypatch):
+def test_observation_of_the_wrong_shape_is_a_simulation_error(num_envs, monkeypatch):
     monkeypatch.setattr(Planted, "reset", lambda self, **_: (np.zeros(2), {}))
     monkeypatch.setattr(Planted, "count", 0, raising=False)
     words = r"observation has shape \(2,\) and not its space's \(3,\) at step 0 of episode 1"
@@ -42,7 +42,7 @@ def test_a_divergence_that_dm_control_reports_is_a_simulation_error(tmp_path, mo
         env.rand_step(td)
 
 
-def test_an_action_that_is_not_finite_blames_the_policy():
+def test_non_finite_action_blames_the_policy():
     env = make_env("myoHandPenTwirl", seed=0)
     action = torch.zeros(39)
     action[5] = float("nan")

@@ -60,7 +60,7 @@ def body():
     return Body()
 
 
-def test_torques_are_moment_arms_times_forces_and_tied_joints_add_theirs(body):
+def test_torques_are_moment_arms_times_forces_summed_over_coupled_joints(body):
     torques = joint_torques(body, num_postures=1)
     assert torques.joints == ("knee",)  # the slide is tied to it, and nothing turns the third
     flexor, extensor, slider = torques.matrix[0]
@@ -70,14 +70,14 @@ def test_torques_are_moment_arms_times_forces_and_tied_joints_add_theirs(body):
     assert slider / flexor == pytest.approx(5.0, rel=1e-6)
 
 
-def test_the_state_of_the_environment_is_left_alone(body):
+def test_joint_torques_keep_the_state_of_the_simulator(body):
     body.data.qpos[0], body.data.act[:] = 0.1, 0.3
     joint_torques(body, num_postures=3)
     assert body.data.qpos[0] == 0.1
     assert (body.data.act == 0.3).all()
 
 
-def test_postures_repeat_by_their_seed_and_matter_by_their_spread(body):
+def test_postures_depend_on_seed_and_spread(body):
     one, again, other = (joint_torques(body, num_postures=5, seed=s).matrix for s in (0, 0, 1))
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other)
@@ -85,7 +85,7 @@ def test_postures_repeat_by_their_seed_and_matter_by_their_spread(body):
     assert still == pytest.approx(joint_torques(body, num_postures=1).matrix)
 
 
-def test_other_actuators_than_muscles_are_refused():
+def test_bodies_with_other_actuators_than_muscles_are_refused():
     motors = BODY.replace(
         '<muscle name="slider" tendon="slider" force="100" lengthrange="-3 3"/>',
         '<motor name="slider" tendon="slider"/>',
@@ -110,7 +110,7 @@ def test_legs_turn_seven_joints_each_and_the_sides_mirror():
     assert not ((np.abs(matrix[:7]).max(0) > 1e-6) & (np.abs(matrix[7:]).max(0) > 1e-6)).any()
 
 
-def test_uniform_noise_on_a_hand_has_the_share_of_chance():
+def test_uniform_noise_on_a_hand_has_chance_share():
     env = make_env("myoHandPenTwirl", seed=0)
     env.reset()
     torques = joint_torques(env, num_postures=2)
@@ -121,7 +121,7 @@ def test_uniform_noise_on_a_hand_has_the_share_of_chance():
 
 
 @pytest.mark.parametrize("task", ["myoHandPenTwirl", "myoLegWalk"])
-def test_excitations_are_what_the_simulator_is_driven_with(task):
+def test_excitation_equals_the_simulators_controls(task):
     env = make_env(task, seed=0)
     action = env.reset()
     action["action"] = env.action_spec.rand()
@@ -131,9 +131,7 @@ def test_excitations_are_what_the_simulator_is_driven_with(task):
 
 
 @pytest.mark.parametrize(("low", "told", "sigmoid"), [(0.0, None, False), (-1.0, True, True)])
-def test_a_body_of_one_s_own_says_by_bounds_and_flag_how_actions_excite_it(
-    body, low, told, sigmoid
-):
+def test_bounds_and_flag_of_a_custom_body_define_its_excitation(body, low, told, sigmoid):
     body.action_space, body.normalize_act = gym.spaces.Box(low, 1.0, (3,)), told
     assert sends_sigmoid(body, body.action_space.low, body.action_space.high) is sigmoid
     parts = NamedObservation(body, activations=True, muscle_lengths=True).observation_space
@@ -141,7 +139,7 @@ def test_a_body_of_one_s_own_says_by_bounds_and_flag_how_actions_excite_it(
 
 
 @pytest.mark.parametrize("told", [None, False])
-def test_a_body_that_does_not_say_how_its_actions_excite_it_is_one_sentence(body, told):
+def test_custom_body_with_undefined_excitation_is_refused(body, told):
     body.action_space, body.normalize_act = gym.spaces.Box(-1.0, 1.0, (3,)), told
     env = GymWrapper(body)
     for asked in (

@@ -9,7 +9,7 @@ from torchrl_etl.envs import actuator_names, make_env
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_held_hand_activation_settles_at_the_action(num_envs):
+def test_hand_activation_settles_at_a_constant_action(num_envs):
     env = make_env("myoHandPose", num_envs=num_envs, seed=0, activations=True)
     td = env.reset()
     assert torch.equal(td["activation"], -torch.ones_like(td["activation"]))
@@ -19,7 +19,7 @@ def test_held_hand_activation_settles_at_the_action(num_envs):
     torch.testing.assert_close(td["activation"], action, atol=2e-3, rtol=0)
 
 
-def test_leg_activation_is_the_simulators_own():
+def test_leg_activation_equals_the_simulators():
     env = make_env("myoLegWalk", seed=0, activations=True)
     td = env.rand_step(env.reset())
     truth = torch.as_tensor(env._env.unwrapped.data.act, dtype=torch.float32)
@@ -34,7 +34,7 @@ def test_activation_needs_muscles():
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 @pytest.mark.parametrize("name", ["myoHandPose", "myoLegWalk"])
-def test_muscle_length_is_the_simulators_own(name, num_envs):
+def test_muscle_length_equals_the_simulators(name, num_envs):
     env = make_env(name, num_envs=num_envs, seed=0, muscle_lengths=True)
     simulators = [env._env] if num_envs == 1 else env._env.envs
 
@@ -51,7 +51,7 @@ def test_muscle_length_is_the_simulators_own(name, num_envs):
     check(env.rand_step(td)["next"])
 
 
-def test_an_excited_muscle_shortens_its_own_entry():
+def test_exciting_a_muscle_shortens_it():
     env = make_env("myoHandPose", seed=0, muscle_lengths=True)
 
     def lengths_after(action):
@@ -69,7 +69,7 @@ def test_an_excited_muscle_shortens_its_own_entry():
         assert lengths_after(action)[muscle] < before[muscle] - 1e-3, muscle
 
 
-def test_muscle_lengths_and_activations_come_together_and_pass_the_specs():
+def test_env_specs_are_valid_with_lengths_and_activations():
     env = make_env("myoHandPose", num_envs=2, seed=0, activations=True, muscle_lengths=True)
     check_env_specs(env)
     assert env.observation_spec["muscle_length"].shape == (2, 39)
@@ -81,13 +81,13 @@ def test_muscle_lengths_need_muscles(name):
         make_env(name, muscle_lengths=True)
 
 
-def test_muscles_of_the_hand_are_the_same_by_name_and_order():
+def test_hand_tasks_have_the_same_muscles_in_the_same_order():
     pose, pen = actuator_names("myoHandPose"), actuator_names("myoHandPenTwirl")
     assert pose == pen and pose[0] == "ECRL" and len(pose) == 39
     assert actuator_names("myoRelocate")[-39:] == pose
 
 
-def test_legs_keep_their_sides():
+def test_leg_muscle_names_end_with_their_side():
     names = actuator_names("myoLegWalk")
     assert {name[-2:] for name in names} == {"_r", "_l"}
     assert names == actuator_names("myoLegStairTerrainWalk")

@@ -23,7 +23,7 @@ def played(name, steps=50):
     return np.array(rewards), np.array(contacts), td["observation"].numpy()
 
 
-def test_it_is_the_task_of_myosuite_2():
+def test_myo2_hand_pose_matches_myosuite_2():
     # Return, contacts and joint angles of the same steps in myosuite 2.5.0 and 2.12.2, on the
     # mujoco of requirements.lock. The two agree to the digits that are compared.
     rewards, contacts, observation = played("myo2HandPose")
@@ -33,14 +33,14 @@ def test_it_is_the_task_of_myosuite_2():
     assert observation[:5] == pytest.approx(recorded, abs=1e-4)
 
 
-def test_myosuite_3_has_another():
+def test_hand_pose_of_myosuite_3_differs():
     # Once this fails, MyoSuite's own Hand Pose has contacts again and may be the old task.
     rewards, contacts, _ = played("myoHandPose")
     assert contacts.sum() == 0
     assert rewards.sum() == pytest.approx(-174.51, abs=0.1)
 
 
-def test_the_goals_are_those_of_its_successor():
+def test_goals_equal_those_of_myosuite_3():
     for goal in ("fixed", "random"):
         old, new = (make_env(name, goal=goal, seed=0) for name in ("myo2HandPose", "myoHandPose"))
         angles = []

@@ -59,19 +59,19 @@ def test_a_module_in_the_current_folder_registers_its_task(own):
     assert actuator_names(own) == [f"actuator_{i}" for i in range(4)]
 
 
-def test_an_id_that_the_module_does_not_register_is_one_sentence(own):
+def test_id_not_registered_by_the_module_is_refused(own):
     module = own.partition(":")[0]
     with pytest.raises(ValueError, match=f"Importing '{module}' registers no task 'Raech-v0'"):
         resolve_task(f"{module}:Raech-v0")
 
 
 @pytest.mark.parametrize("module", ["no_such_module", "os.no_such", ".relative"])
-def test_a_module_that_is_not_there_is_one_sentence(module):
+def test_missing_module_is_refused(module):
     with pytest.raises(ImportError, match=f"There is no module '{module}' for the task"):
         resolve_task(f"{module}:Reach-v0")
 
 
-def test_what_the_module_itself_lacks_is_told_as_it_is(tmp_path, monkeypatch):
+def test_import_error_within_the_module_is_passed_on(tmp_path, monkeypatch):
     (tmp_path / "needs_more.py").write_text("import not_installed_at_all")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="No module named 'not_installed_at_all'"):
@@ -79,7 +79,7 @@ def test_what_the_module_itself_lacks_is_told_as_it_is(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_recipe_trains_and_evaluates_a_task_of_one_s_own(own, tmp_path):
+def test_recipe_trains_and_evaluates_a_users_task(own, tmp_path):
     run = f"run_dir='{tmp_path}/run'"
     assert command("etl_sac.py", *SMALL, f"env={own}", "success_key=arrived", run) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -89,7 +89,7 @@ def test_a_recipe_trains_and_evaluates_a_task_of_one_s_own(own, tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_find_a_task_of_one_s_own_and_a_recipe_elsewhere_does_not(own, tmp_path):
+def test_workers_find_a_users_task_but_not_a_recipe_in_another_folder(own, tmp_path):
     settings = ("collector=process", "success_key=arrived", f"run_dir='{tmp_path}/run'")
     done = process("etl_sac.py", *SMALL, f"env={own}", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -109,26 +109,26 @@ def test_workers_find_a_task_of_one_s_own_and_a_recipe_elsewhere_does_not(own, t
         ("myoHandPose", "fixed"),
     ],
 )
-def test_an_id_says_its_goal(name, goal):
+def test_goal_is_read_from_the_id(name, goal):
     task = resolve_task(name)
     assert task.goal == goal
     assert task.goal_in_words == (f" ({goal} goal)" if goal else "")
 
 
-def test_a_goal_that_another_id_contradicts_is_refused():
+def test_goal_that_contradicts_the_id_is_refused():
     with pytest.raises(ValueError, match="names its random goal itself"):
         resolve_task("myoElbowPose1D6MRandom-v0", "fixed")
 
 
 @pytest.mark.parametrize("name", ["cheetah-run", "Pendulum-v1", "myoElbowPose1D6MRandom-v0"])
-def test_copies_of_an_unseeded_environment_start_apart(name):
+def test_unseeded_environments_start_in_different_states(name):
     first, second = make_env(name, num_envs=2).reset()["observation"]
     alone = make_env(name).reset()["observation"]
     assert not torch.equal(first, second)
     assert not torch.equal(first, alone)
 
 
-def test_of_more_actuators_than_the_action_has_entries_the_muscles_are_named():
+def test_actuator_names_leave_out_motors_that_actions_do_not_drive():
     names = actuator_names("myoChallengeOslRunFixed-v0")  # 54 muscles, 2 motors of a prosthesis
     assert len(names) == len(set(names)) == 54
     assert not [name for name in names if "osl" in name.lower()]

@@ -43,16 +43,16 @@ def share_solved(env, solved_steps, **options):
 
 
 @pytest.mark.parametrize("key", ["solved", "is_success", "success"])
-def test_success_of_any_usual_name_becomes_solved(key):
+def test_usual_success_keys_become_solved(key):
     env = make_env(PLANTED, env_kwargs={"key": key})
     assert env.rollout(3)["next", "solved"].flatten().tolist() == [False, True, True]
 
 
-def test_no_solved_without_success():
+def test_env_without_success_has_no_solved_entry():
     assert "solved" not in make_env(PLANTED, env_kwargs={"key": None}).reset()
 
 
-def test_success_in_the_last_info_alone_is_seen_and_an_episode_that_ends_with_it_counts():
+def test_success_in_the_last_info_only_counts_as_solved():
     env = make_env(ENDS)
     assert env.rollout(9)["next", "solved"].flatten().tolist() == [False, False, False, True]
     measured = share_solved(env, resolve_task(ENDS).solved_steps)
@@ -60,21 +60,21 @@ def test_success_in_the_last_info_alone_is_seen_and_an_episode_that_ends_with_it
     assert measured.solved_steps == [1, 1] and measured.lengths == [4, 4]
 
 
-def test_without_a_threshold_success_that_is_lost_again_does_not_count():
+def test_without_a_threshold_lost_success_does_not_count():
     env = make_env(ENDS, env_kwargs={"solved": (1, 2, 3)})
     assert share_solved(env, None).successes == [False, False]
     assert share_solved(env, 3).successes == [True, True]
     assert share_solved(env, 4).successes == [False, False]
 
 
-def test_a_threshold_counts_steps_of_the_simulator_however_long_an_action_lasts():
+def test_threshold_counts_simulator_steps_under_action_repeat():
     env = make_env(ENDS, action_repeat=2, env_kwargs={"solved": (1, 2, 3, 4)})
     assert share_solved(env, 4, action_repeat=2).successes == [True, True]
     assert share_solved(env, 5, action_repeat=2).successes == [False, False]
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_the_entry_that_means_success_can_be_named(num_envs):
+def test_success_key_names_the_info_entry(num_envs):
     env_kwargs = {"key": "arrived"}
     assert "solved" not in make_env(ENDS, env_kwargs=env_kwargs).reset()
     env = make_env(ENDS, num_envs=num_envs, success_key="arrived", env_kwargs=env_kwargs)
@@ -82,7 +82,7 @@ def test_the_entry_that_means_success_can_be_named(num_envs):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_name_that_info_never_has_is_told_at_the_end_of_the_first_episode():
+def test_success_key_missing_from_info_warns_after_the_first_episode():
     env = make_env(ENDS, success_key="arived", env_kwargs={"key": "arrived"})
     env.rollout(3)
     with pytest.raises(RuntimeWarning, match=r"success_key is 'arived', .*it has arrived"):
@@ -103,7 +103,7 @@ def test_a_name_that_info_never_has_is_told_at_the_end_of_the_first_episode():
         (ENDS, None),
     ],
 )
-def test_only_tasks_that_define_a_threshold_of_solved_steps_have_one(name, steps):
+def test_solved_steps_of_tasks_with_and_without_a_threshold(name, steps):
     assert resolve_task(name).solved_steps == steps
 
 

@@ -26,7 +26,7 @@ PAPER = {
 }
 
 
-def test_the_papers_thirteen_resolve():
+def test_the_papers_thirteen_tasks_resolve():
     assert {task.name: resolve_task(task.name).env_id for task in list_tasks()} == PAPER
 
 
@@ -76,7 +76,7 @@ def test_unknown_goal_is_refused():
         ("myoHandPoseRandom-v1", "myoHandPoseRandom-v0"),
     ],
 )
-def test_wrong_name_is_told_the_nearest_right_one(wrong, right):
+def test_unknown_task_suggests_the_nearest_name(wrong, right):
     with pytest.raises(ValueError, match=f"Unknown task '{wrong}'; .* {right}[,.;]"):
         resolve_task(wrong)
 
@@ -108,7 +108,7 @@ def test_paper_names_resolve_without_importing_a_simulator():
     ("name", "random_actions_drop"),
     [("myoBaoding", True), ("myoDieReorient", True), ("myoRelocate", False)],
 )
-def test_a_drop_ends_nothing_where_episodes_are_full(name, random_actions_drop):
+def test_dropping_the_object_does_not_end_full_episodes(name, random_actions_drop):
     torch.manual_seed(0)
     full = make_env(f"{name}Full", seed=0).rollout(1000)
     ends = full["next", "done"].squeeze(-1).nonzero().flatten().tolist()
@@ -123,7 +123,7 @@ def test_a_drop_ends_nothing_where_episodes_are_full(name, random_actions_drop):
     torch.testing.assert_close(full["next", "reward"][:steps], early["next", "reward"])
 
 
-def test_full_episodes_are_tasks_beside_the_papers_and_the_ids_keep_their_meaning():
+def test_full_tasks_are_not_listed_and_keep_the_ids_meaning():
     assert resolve_task("myoBaodingFull").env_id == resolve_task("myoBaoding").env_id
     assert resolve_task("myoChallengeBaodingP1-v1").ends_early
     assert not any(task.name.endswith("Full") for task in list_tasks())

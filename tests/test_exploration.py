@@ -31,7 +31,7 @@ def step(policy: HeldNoise, begins: bool | torch.Tensor = False, rows: int = ROW
         return policy(TensorDict(entries, [rows]))["action"]
 
 
-def test_every_step_is_distributed_as_the_actor_says():
+def test_held_noise_has_the_actors_distribution():
     held = policy()
     for _ in range(5):
         action = step(held)
@@ -44,7 +44,7 @@ def test_every_step_is_distributed_as_the_actor_says():
     assert correlation.abs() < 3 / ROWS**0.5
 
 
-def test_noise_lasts_as_long_as_the_zeta_distribution_says():
+def test_durations_follow_the_truncated_zeta_distribution():
     held, longest = policy(longest=3, exponent=1.0), 3
     first = step(held, True)
     lasts = torch.ones(ROWS, dtype=torch.long)
@@ -67,7 +67,7 @@ def test_an_episode_begins_with_fresh_noise_and_rows_are_independent():
     assert first.unique(dim=0).shape[0] == 4
 
 
-def test_without_random_exploration_it_is_the_actor():
+def test_without_random_exploration_actions_are_the_actors():
     held = policy()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         action = step(held, rows=3)
@@ -75,7 +75,7 @@ def test_without_random_exploration_it_is_the_actor():
         torch.testing.assert_close(action, held.actor(entries)["action"])
 
 
-def test_its_memory_is_no_part_of_its_state():
+def test_state_dict_excludes_the_held_noise():
     held = policy()
     keys = set(held.state_dict())
     step(held, True)
@@ -98,12 +98,12 @@ def test_an_actor_without_a_tanh_gaussian_is_refused(kind: type):
         HeldNoise(actor_of(kind))
 
 
-def test_out_keys_are_what_is_written():
+def test_out_keys_are_the_written_entries():
     held = HeldNoise(actor_of(TanhNormal))
     data = TensorDict({"observation": torch.ones(2, 3), "is_init": torch.ones(2, 1).bool()}, [2])
     assert set(held.out_keys) == set(held(data.clone()).keys()) - set(data.keys())
 
 
-def test_data_that_does_not_say_where_episodes_begin_are_one_sentence():
+def test_data_without_is_init_are_refused():
     with pytest.raises(KeyError, match=r"'is_init', which the data lacks.* an InitTracker\(\)"):
         policy()(TensorDict({"observation": torch.ones(2, 3)}, [2]))

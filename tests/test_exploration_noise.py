@@ -30,7 +30,7 @@ def test_actions_are_the_tanh_of_the_noise_in_the_bounds():
 
 
 @pytest.mark.parametrize("color", ["pink", "held"])
-def test_an_update_moves_the_gmvae_alone(color):
+def test_update_changes_only_the_gmvae(color):
     found = explorer(NOISE, f"exploration.color={color}")
     stage, learner = found.stage, found.stage.learner
     fill(stage)
@@ -53,7 +53,7 @@ def test_synergies_that_are_fitted_once_get_no_updates():
     found.stage.close()
 
 
-def test_both_stages_run_on_noise_and_tell_no_directions(tmp_path):
+def test_both_stages_run_on_noise_without_direction_alignment(tmp_path):
     brief = ("explore.frames=192", "learn.frames=64", "evaluation.episodes=1", "synergies=nmf")
     summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", NOISE, *brief)).run()
     assert summary["learn"]["frames_charged"] == 192 + 64
@@ -62,7 +62,7 @@ def test_both_stages_run_on_noise_and_tell_no_directions(tmp_path):
 
 
 @pytest.mark.parametrize("color", ["pink", "held"])
-def test_a_resumed_stage_goes_on_with_the_same_numbers(color, tmp_path):
+def test_resumed_stage_equals_an_uninterrupted_one(color, tmp_path):
     settings = (NOISE, f"exploration.color={color}")
     assert goes_on_after_a_load(lambda: explorer(*settings).stage, tmp_path)
 
@@ -86,6 +86,6 @@ def test_noise_is_drawn_in_worker_processes_too():
         ("exploration.color=held exploration.exponent=0", "exploration.exponent is 0"),
     ],
 )
-def test_what_noise_cannot_do_is_one_sentence(settings, words):
+def test_settings_unusable_with_noise_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         explorer(NOISE, *settings.split())

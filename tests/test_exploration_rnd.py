@@ -21,7 +21,7 @@ def found():
     found.stage.close()
 
 
-def test_the_policy_is_paid_with_the_bonus_and_reads_the_observation_alone(found):
+def test_policy_is_rewarded_by_the_bonus_and_has_no_direction(found):
     assert found.exploration.reward == "intrinsic_reward"
     assert found.stage.learner.objective.sac.tensor_keys.reward == "intrinsic_reward"
     batch = prepared(found.stage)
@@ -39,7 +39,7 @@ def test_one_update_moves_policy_predictor_and_gmvae_but_not_the_random_network(
     assert not changed(loss.target_network, fixed)
 
 
-def test_only_the_terms_loss_reaches_the_predictor(found):
+def test_predictor_gets_gradients_from_its_loss_and_not_from_sac(found):
     loss, objective = found.exploration.loss, found.stage.learner.objective
     batch = prepared(found.stage)
     parameters = list(loss.predictor_network.parameters())
@@ -50,7 +50,7 @@ def test_only_the_terms_loss_reaches_the_predictor(found):
     assert torch.autograd.grad(total, parameters, allow_unused=True) == (None,) * len(parameters)
 
 
-def test_the_bonus_of_what_the_predictor_learned_fades():
+def test_bonus_fades_as_the_predictor_learns():
     spec = EnvironmentSpec.of(make_env("overactuated"))
     scale = {"normalize": False}
     rnd = RNDExploration(spec, features=8, hidden=[16], lr=1e-2, bonus=scale)
@@ -95,7 +95,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
             torch.testing.assert_close(ours[name], value)
 
 
-def test_a_resumed_stage_goes_on_with_the_same_numbers(tmp_path):
+def test_resumed_stage_equals_an_uninterrupted_one(tmp_path):
     assert goes_on_after_a_load(lambda: explorer(*SMALL).stage, tmp_path)
 
 

@@ -26,11 +26,11 @@ class Counted(Exploration):
         return (StepCounter(),)
 
 
-def test_noise_of_the_actor_that_is_configured_for_stage_1_collects():
+def test_configured_actor_noise_is_the_behavior_policy_of_stage_1():
     assert isinstance(explorer("explore.noise.kind=held").stage.learner.behavior, HeldNoise)
 
 
-def test_synergies_see_actions_for_the_directions_that_the_exploration_relabels():
+def test_synergies_are_fitted_to_actions_for_relabeled_directions():
     """Of the policy as it is now, for other directions than those that were followed."""
     found = explorer()
     found.stage.collect()
@@ -45,7 +45,7 @@ def test_synergies_see_actions_for_the_directions_that_the_exploration_relabels(
     found.stage.close()
 
 
-def test_a_transform_that_the_fast_collector_cannot_take_is_collected_with_torchrls():
+def test_unsupported_transform_falls_back_to_torchrls_collector():
     config = tiny("run_dir=unused")
     config.exploration.kind = f"{__name__}:Counted"
     with pytest.warns(UserWarning, match="since StepCounter has no array_step and array_reset"):

@@ -127,7 +127,7 @@ def test_the_page_has_one_short_python_file_and_one_yaml_file_for_each():
         assert sum(bool(line.strip()) for line in code.splitlines()) < 40, name
 
 
-def test_both_stages_run_with_the_toys(own, tmp_path):
+def test_both_stages_run_with_the_classes_of_the_page(own, tmp_path):
     settings = ("learn.prefill=true", "learn.decoder.residual=0.5", *BRIEF)
     summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings)).run()
     assert summary["learn"]["frames"] == 64
@@ -140,7 +140,7 @@ def of_this_file(kind, tmp_path):
     return tiny(f"run_dir='{tmp_path}/run'", *own, "pictures=true", "vaf_curve.dims=[1]")
 
 
-def test_a_model_with_a_loss_goes_through_both_stages_with_its_pictures(tmp_path):
+def test_synergy_model_with_a_loss_runs_both_stages_and_draws_pictures(tmp_path):
     summary = Experiment(of_this_file("Learned", tmp_path)).run()
     assert summary["learn"]["frames"] == 64
     assert load_bundle(tmp_path / "run")[1].kind == "learned"
@@ -149,9 +149,7 @@ def test_a_model_with_a_loss_goes_through_both_stages_with_its_pictures(tmp_path
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_what_an_exploration_embeds_of_whole_transitions_is_told_or_why_not(
-    fails, tmp_path, monkeypatch
-):
+def test_alignment_of_a_users_embed_or_its_error_is_reported(fails, tmp_path, monkeypatch):
     def embed(self, rows):
         raise KeyError("phase")
 
@@ -164,7 +162,7 @@ def test_what_an_exploration_embeds_of_whole_transitions_is_told_or_why_not(
     assert any("could not embed its transitions (KeyError('phase'))" in s for s in said) is fails
 
 
-def test_a_logger_of_one_s_own_gets_the_run_s_numbers_and_another_class_is_refused(tmp_path):
+def test_users_logger_gets_the_scalars_and_another_class_is_refused(tmp_path):
     name = "tests.test_extend:Remembering"
     asked = ("method=sac", "learn.frames=64", "evaluation.episodes=1", f"log=['{name}']")
     config = tiny(f"run_dir='{tmp_path}/run'", *asked)
@@ -179,21 +177,21 @@ def test_a_logger_of_one_s_own_gets_the_run_s_numbers_and_another_class_is_refus
         Experiment(config)
 
 
-def test_a_model_whose_decoder_no_bundle_holds_is_refused_before_stage_1(tmp_path):
+def test_model_with_an_unsupported_decoder_is_refused_before_stage_1(tmp_path):
     words = "NoBundle, whose decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
     with pytest.raises(ValueError, match=words):
         Experiment(of_this_file("NoBundle", tmp_path))
     assert not (tmp_path / "run").exists()
 
 
-def test_stage_1_of_the_toys_goes_on_after_a_kill_with_the_same_numbers(own, tmp_path):
+def test_stage_1_with_the_classes_of_the_page_resumes_with_equal_numbers(own, tmp_path):
     def make():
         return Explorer(Experiment(tiny("run_dir=unused", *OWN)).context).stage
 
     assert goes_on_after_a_load(make, tmp_path)
 
 
-def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(own):
+def test_curiosity_rewards_the_prediction_error_and_trains_its_model(own):
     found = Explorer(Experiment(tiny("run_dir=unused", *OWN)).context)
     found.stage.restart_collection()
     for _ in range(6):
@@ -208,7 +206,7 @@ def test_the_toy_exploration_pays_for_the_error_and_trains_its_model(own):
     found.stage.close()
 
 
-def test_the_toy_synergies_fit_recordings_worse_than_nmf(own, capsys):
+def test_random_synergies_fit_recordings_worse_than_nmf(own, capsys):
     code = compile(FILES["recordings.py"], "recordings.py", "exec")
     sys.path.append("")
     exec(code, {"__name__": "__main__"})
@@ -216,7 +214,7 @@ def test_the_toy_synergies_fit_recordings_worse_than_nmf(own, capsys):
     assert nmf > 0.99 > at_random > 0
 
 
-def test_the_toy_method_runs_and_goes_on_after_a_kill_with_the_same_numbers(own, tmp_path):
+def test_thrift_method_runs_and_resumes_with_equal_numbers(own, tmp_path):
     def make():
         return Experiment(tiny("run_dir=unused", "method=thrift")).method.stage()
 
@@ -227,7 +225,7 @@ def test_the_toy_method_runs_and_goes_on_after_a_kill_with_the_same_numbers(own,
     assert resumed_config(tmp_path / "run").method.kind == "thrift:Thrift"
 
 
-def test_the_toy_method_learns_on_the_reward_less_the_effort(own):
+def test_thrift_method_learns_on_reward_minus_effort(own):
     asked = ("method=thrift", "method.options.price=2")
     stage = Experiment(tiny("run_dir=unused", *asked)).method.stage()
     stage.restart_collection()
@@ -251,14 +249,14 @@ def test_the_toy_method_learns_on_the_reward_less_the_effort(own):
         ("kind", None, r"method\.kind is None; choose one of etl, sac, lattice"),
     ],
 )
-def test_a_method_that_cannot_be_had_is_one_sentence(key, value, words, own):
+def test_unusable_method_settings_are_refused(key, value, words, own):
     config = tiny("run_dir=unused", "method=thrift")
     OmegaConf.update(config, f"method.{key}", value, force_add=True)
     with pytest.raises(ValueError, match=words):
         Experiment(config)
 
 
-def test_the_command_line_knows_kinds_that_have_a_file(own):
+def test_command_line_accepts_kinds_with_a_config_file(own):
     settings = ("exploration.lr=0.1", "synergies.seed=3", "method=thrift", "method.options.price=1")
     check_overrides(CONF / "config.yaml", [*OWN, *settings], "")
     assert translate(["synergies=random"], CONF) == ["synergies=random"]
@@ -267,7 +265,7 @@ def test_the_command_line_knows_kinds_that_have_a_file(own):
     assert translate(kinds, CONF) == ["method.kind=a:B", "method=sar"]
 
 
-def test_a_recipe_finds_the_files_of_one_s_own_and_their_settings(own, capsys):
+def test_recipe_finds_a_users_config_files(own, capsys):
     assert command("etl_sac.py", *OWN, "method=thrift", "synergies.seed=3", "--cfg=job") == 0
     config = OmegaConf.create(capsys.readouterr().out)
     kinds = [config[group].kind for group in ("exploration", "synergies", "method")]
@@ -276,7 +274,7 @@ def test_a_recipe_finds_the_files_of_one_s_own_and_their_settings(own, capsys):
     assert "exploration:   # exploration=curiosity\n  kind: curiosity" in capsys.readouterr().out
 
 
-def test_the_command_of_a_run_names_the_files_of_one_s_own_and_can_be_run(own):
+def test_exported_command_names_a_users_config_files(own):
     made = tiny("run_dir=unused", *OWN, "exploration.lr=0.1")
     told = shlex.split(command_of(made, composed, CONF, "toy"))[2:]
     assert {*OWN, "exploration.lr=0.1"} < {*told}
@@ -292,19 +290,19 @@ def test_the_command_of_a_run_names_the_files_of_one_s_own_and_can_be_run(own):
         ("curiosity", ValueError, r"exploration\.kind is 'curiosity'; choose one of metric, metra"),
     ],
 )
-def test_a_kind_that_is_not_there_is_one_sentence(kind, error, words, own):
+def test_unknown_exploration_kind_is_refused(kind, error, words, own):
     config = tiny("run_dir=unused", *OWN)
     config.exploration.kind = kind
     with pytest.raises(error, match=words):
         Explorer(Experiment(config).context)
 
 
-def test_a_kind_of_one_s_own_without_its_file_is_told_to_get_one(own):
+def test_users_kind_without_a_config_file_is_refused(own):
     config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity")
     with pytest.raises(ValueError, match=r"a file of its own in \./conf/exploration\.$"):
         Explorer(Experiment(config).context)
 
 
-def test_fit_synergies_takes_a_class_of_one_s_own_by_its_name(own):
+def test_fit_synergies_takes_a_users_class_by_name(own):
     model = fit_synergies(torch.rand(50, 6), "at_random:RandomSynergies", 2, seed=3)
     assert (model.kind, model.seed) == ("random", 3)

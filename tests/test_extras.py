@@ -83,7 +83,7 @@ def _with_what_they_need(names: set[str]) -> set[str]:
     return every
 
 
-def test_without_extras_every_package_imports_and_a_missing_extra_is_one_sentence():
+def test_package_imports_without_extras_and_names_a_missing_one():
     core = _with_what_they_need(_names(PROJECT["dependencies"]))
     extras = PROJECT["optional-dependencies"]
     optional = _names(r for name in extras.keys() - {"all", "dev"} for r in extras[name]) - core
@@ -107,7 +107,7 @@ def test_without_extras_every_package_imports_and_a_missing_extra_is_one_sentenc
         assert f"pip install 'torchrl_etl[{extra}]'" in sentence
 
 
-def test_what_the_package_exports_is_what_its_parts_export():
+def test_top_level_exports_are_those_of_the_subpackages():
     assert sorted(torchrl_etl.__all__) == sorted(sum(torchrl_etl._HOMES.values(), ()))
     for home, names in torchrl_etl._HOMES.items():
         for name in names:
@@ -116,7 +116,7 @@ def test_what_the_package_exports_is_what_its_parts_export():
     assert (Path(torchrl_etl.__file__).parent / "py.typed").is_file()
 
 
-def test_every_extra_that_the_code_names_exists_and_all_of_them_are_in_all():
+def test_extras_named_in_code_exist_and_all_lists_every_extra():
     sources = (ROOT / "torchrl_etl").rglob("*.py")
     named = {
         n for path in sources for n in re.findall(r'extra\("(\w+)"\)', path.read_text("utf-8"))

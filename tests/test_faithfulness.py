@@ -65,7 +65,7 @@ def test_every_deviation_in_the_code_has_a_row(file, owner):
     assert any(f"`{owner}`" in row[5] for row in rows()), f"{owner} of {file} is not on the page"
 
 
-def test_deviations_are_found_wherever_they_are_written():
+def test_every_deviates_note_is_in_a_docstring():
     found = sum(
         path.read_text(encoding="utf-8").count("Deviates:")
         for path in (ROOT / "torchrl_etl").rglob("*.py")
@@ -73,7 +73,7 @@ def test_deviations_are_found_wherever_they_are_written():
     assert found == len(list(owners())), "Deviates: stands outside a docstring"
 
 
-def test_every_row_is_whole_and_names_tests_that_exist():
+def test_every_row_is_complete_and_names_existing_tests():
     assert len(rows()) > 20
     for row in rows():
         named = TEST.findall(row[6])
@@ -100,7 +100,7 @@ def test_every_setting_on_the_page_is_accepted_as_written(setting):
         compose("config", overrides=[setting])
 
 
-def test_the_paper_preset_reaches_the_parts_it_is_about():
+def test_paper_preset_configures_bonus_regularizer_and_relabeling():
     paper = explored("faithful=paper")
     paper.stage.update()
     (relabel,), (bonus,) = paper.relabel, paper.stage.learner.objective.transforms
@@ -112,14 +112,14 @@ def test_the_paper_preset_reaches_the_parts_it_is_about():
     torch.testing.assert_close(paper.actions(), kept["action"])
 
 
-def test_embedding_size_follows_the_synergies_unless_given():
+def test_embedding_dim_defaults_to_num_synergies():
     assert explored("num_synergies=3").exploration.encoder.embedding_dim == 3
     other = explored("num_synergies=3", "exploration.encoder.embedding_dim=5")
     assert other.exploration.encoder.embedding_dim == 5
     assert other.stage.buffer.storage[:]["direction"].shape[-1] == 5
 
 
-def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
+def test_stage_1_metric_reads_the_task_reward_and_not_the_bonus():
     stage = explored().stage
     batch = prepared(stage)
     objective = stage.learner.objective
@@ -142,14 +142,14 @@ def test_the_metric_of_stage_1_reads_the_reward_of_the_task_and_not_the_bonus():
 
 
 @pytest.mark.parametrize(("updates", "trained"), [(0, False), (3, True)])
-def test_the_gmvae_is_trained_on_after_the_last_frame_unless_told_not_to(updates, trained):
+def test_gmvae_gets_final_updates_after_the_last_frame_unless_zero(updates, trained):
     found = explored(f"explore.fit.final_updates={updates}")
     before = found.model.model.prior_loc.clone()
     alone(found.condense())
     assert (not torch.equal(found.model.model.prior_loc, before)) is trained
 
 
-def test_entropy_target_of_stage_1_is_sacs_usual_under_the_paper_preset():
+def test_stage_1_entropy_target_is_that_of_action_std_or_sacs_usual():
     usual = explored("explore.sac.action_std=null").stage.learner.objective.sac.target_entropy
     assert usual.item() == pytest.approx(-16.0)
     # 16 muscles, each ln(0.15 * sqrt(2 * pi * e)).

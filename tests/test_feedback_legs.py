@@ -17,14 +17,14 @@ def _after(env: gym.Env, steps: int) -> np.ndarray:
     return observation
 
 
-def test_gains_of_zero_leave_the_task_as_it_is():
+def test_zero_gains_leave_the_task_unchanged():
     plain = make_env("myoLegWalk", seed=0)._env
     still = gym.make(ENV_ID, kp=0.0, kd=0.0, disable_env_checker=True)
     expected = _after(plain, 3)["observation"]
     np.testing.assert_allclose(_after(still, 3), expected, rtol=1e-6)
 
 
-def test_a_stretched_joint_is_answered_by_its_own_synergy():
+def test_feedback_answers_a_joint_displacement_with_its_synergy():
     env = gym.make(ENV_ID, kp=2.0, kd=0.0, disable_env_checker=True)
     env.reset(seed=0)
     body = make_env("myoLegWalk", seed=0)

@@ -28,7 +28,7 @@ def test_bonus_telescopes_along_a_trajectory() -> None:
     torch.testing.assert_close(total, (path[-1] - path[0]) @ direction)
 
 
-def test_bonus_is_largest_along_the_move() -> None:
+def test_bonus_is_largest_along_the_displacement() -> None:
     x, y = doubles(4), doubles(4, seed=1)
     directions = torch.nn.functional.normalize(doubles(500, 4, seed=2), dim=-1)
     best = F.direction_bonus(x, y, torch.nn.functional.normalize(y - x, dim=-1))
@@ -79,7 +79,7 @@ def test_mico_gradient_is_finite_at_the_origin() -> None:
     assert x.grad.isfinite().all()
 
 
-def test_w2_by_hand_and_against_samples_in_one_dimension() -> None:
+def test_w2_by_hand_and_from_quantiles_in_one_dimension() -> None:
     value = F.gaussian_w2(
         torch.tensor([1.0, 0.0]),
         torch.tensor([2.0, 1.0]),
@@ -129,7 +129,7 @@ def test_expected_distance_refuses_a_divergent_series(gamma: float) -> None:
         F.expected_distance(1.0, gamma)
 
 
-def test_discriminability_looks_only_at_pairs_with_like_rewards() -> None:
+def test_discriminability_counts_only_pairs_with_similar_rewards() -> None:
     reward_i, reward_j = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.05, 0.1, 3.0])
     x, y = torch.zeros(3, 2), torch.tensor([[0.3, 0.4]]).expand(3, 2)
     hinge = F.discriminability(reward_i, reward_j, x, y, epsilon=0.1, margin=2.0)
@@ -146,7 +146,7 @@ def test_hinge_pushes_apart_what_literal_pulls_together() -> None:
         assert -x.grad.item() * sign > 0, form  # the way a descent step goes
 
 
-def test_hinge_is_silent_beyond_its_margin() -> None:
+def test_hinge_is_zero_beyond_its_margin() -> None:
     x = torch.tensor([1.5], requires_grad=True)
     penalty = F.discriminability(torch.zeros(()), torch.zeros(()), x, torch.zeros(1), 0.1, 1.0)
     penalty.backward()

@@ -82,7 +82,7 @@ def test_bound_is_the_explicit_sum_over_components() -> None:
         torch.testing.assert_close(terms.bound[b], reconstruction - latent_kl - component_kl)
 
 
-def test_one_component_is_the_bound_of_an_ordinary_vae() -> None:
+def test_bound_with_one_component_is_the_elbo_of_a_vae() -> None:
     x = bound_inputs(components=1)
     x["prior_loc"], x["prior_scale"] = x["prior_loc"] * 0, x["prior_scale"] * 0 + 1
     terms = F.gmvae_bound(**x)

@@ -49,13 +49,13 @@ def counted(*arguments: object) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_chain_holds_the_generators_that_wait(checkout: Path) -> None:
+def test_call_chain_includes_suspended_generators(checkout: Path) -> None:
     names = ["alone", "work", "stage", "loss", "equation"]
     *chain, total = counted(checkout, "chain")
     assert [link.split()[1] for link in chain] == names and total == "5 functions"
 
 
-def test_a_setting_that_another_file_checks_too_is_named(checkout: Path) -> None:
+def test_setting_checked_in_two_files_is_named(checkout: Path) -> None:
     assert counted(checkout, "checks") == [
         "size",
         "3 settings, 1 of these names elsewhere too",

@@ -15,7 +15,7 @@ from torchrl_etl.in_processes import in_processes
 SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")
 
 
-def test_each_process_does_one_run_and_a_run_that_fails_leaves_the_others(tmp_path, capfd):
+def test_each_process_equals_a_single_run_and_survives_a_failed_one(tmp_path, capfd):
     configs = [tiny(f"run_dir='{tmp_path}/{seed}'", f"seed={seed}", *SHORT) for seed in (0, 1)]
     (tmp_path / "1").write_text("a file where the folder should be")
     ends = in_processes([{"config": each, "resume": None, "say": print} for each in configs])
@@ -33,7 +33,7 @@ def children(process: int) -> list[int]:
     return [int(line.split()[0]) for line in listed.splitlines() if "spawn_main" in line]
 
 
-def test_a_process_that_is_killed_and_a_signal_to_stop_are_told_in_a_line_each(tmp_path):
+def test_killed_process_and_sigint_are_reported_with_how_to_resume(tmp_path):
     arguments = [*TINY, "method=sac", "frames=100000", "seeds=[0,1]", f"run_dir='{tmp_path}/run'"]
     running = begun("etl_sac.py", *arguments, cwd=tmp_path)
     folders = [tmp_path / "run" / f"seed{seed}" for seed in (0, 1)]

@@ -13,7 +13,7 @@ class OurError(ValueError):
     """Of the kind that a reader of JSON must not take for a fault of its own."""
 
 
-def test_a_json_file_is_read_as_what_it_holds(tmp_path: Path) -> None:
+def test_json_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "file").write_text('{"a": ["µ"]}', encoding="utf-8")
     assert read_json(tmp_path / "file", dict, OurError, "mend it") == {"a": ["µ"]}
 
@@ -21,9 +21,7 @@ def test_a_json_file_is_read_as_what_it_holds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "fault"), [("gone", "No such file or directory"), ("folder", "Is a directory")]
 )
-def test_a_file_that_is_missing_or_unreadable_is_named(
-    name: str, fault: str, tmp_path: Path
-) -> None:
+def test_missing_or_unreadable_file_is_named(name: str, fault: str, tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for read in (read_bytes, lambda path, *rest: read_json(path, dict, *rest)):
         with pytest.raises(OurError) as caught:
@@ -32,7 +30,7 @@ def test_a_file_that_is_missing_or_unreadable_is_named(
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\x00\n", b"[" * 100_000])
-def test_a_file_that_is_not_json_is_named_with_the_fault(content: bytes, tmp_path: Path) -> None:
+def test_invalid_json_is_named_with_the_fault(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(OurError, match=r"file is not JSON \(.+\); mend it\.$"):
         read_json(tmp_path / "file", dict, OurError, "mend it")
@@ -40,7 +38,9 @@ def test_a_file_that_is_not_json_is_named_with_the_fault(content: bytes, tmp_pat
 
 @pytest.mark.parametrize(("kind", "word"), [(dict, "object"), (list, "array")])
 @pytest.mark.parametrize("content", ["null", "1", '"text"'])
-def test_json_of_another_kind_is_named(kind: type, word: str, content: str, tmp_path: Path) -> None:
+def test_json_of_the_wrong_type_is_named(
+    kind: type, word: str, content: str, tmp_path: Path
+) -> None:
     (tmp_path / "file").write_text(content)
     with pytest.raises(OurError, match=f"file holds no JSON {word}; mend it"):
         read_json(tmp_path / "file", kind, OurError, "mend it")

@@ -20,13 +20,13 @@ def drawn(noise: HeldNormal | PinkNormal, steps: int, rows: int = ROWS) -> torch
 
 
 @pytest.mark.parametrize("noise", [HeldNormal(16), PinkNormal(64)], ids=["held", "pink"])
-def test_every_step_is_standard_normal_the_first_of_an_episode_included(noise):
+def test_steps_are_standard_normal_from_the_first_on(noise):
     rows = drawn(noise, 20)
     for step in (0, 1, 19):
         assert kstest(rows[step], "norm").pvalue > 0.01
 
 
-def test_pink_correlation_over_k_steps_is_the_mean_of_powers_of_its_constants():
+def test_pink_autocorrelation_is_a_mean_of_exponentials():
     """With a_i = exp(-1), exp(-1/2), exp(-1/4): over one step (0.368 + 0.607 + 0.779) / 3."""
     rows = drawn(PinkNormal(longest=7), 12)  # 4 is the largest power of 2 in it
     for steps, expected in ((1, 0.5844), (2, 0.3699), (8, 0.0513)):
@@ -48,7 +48,7 @@ def test_power_of_pink_noise_falls_as_one_over_frequency():
 
 
 @pytest.mark.parametrize("noise", [HeldNormal(1000, 0.01), PinkNormal(1024)], ids=["held", "pink"])
-def test_an_episode_that_begins_knows_nothing_of_the_one_before(noise):
+def test_noise_is_independent_across_episodes(noise):
     rows, like = ROWS, torch.zeros(ROWS, 1)
     begins = torch.arange(rows) < rows // 2
     first = noise(like, torch.ones(rows, dtype=torch.bool)).clone().squeeze(-1)

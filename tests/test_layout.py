@@ -33,7 +33,7 @@ def test_layouts_of_many_cores_share_a_batch_evenly():
     assert max(each.num_workers for each in layouts(6, most_workers=6)) == 2
 
 
-def test_as_many_workers_as_cores_take_turns_with_the_learner():
+def test_last_layout_has_at_most_one_worker_per_core():
     assert [layouts(cores, most_workers=8)[-1].num_workers for cores in (2, 4, 6, 32)] == [
         2,
         4,
@@ -65,7 +65,7 @@ def test_choose_layout_takes_and_names_the_fastest(speeds, fastest, kind, ahead)
     assert line.startswith(f"collector=auto takes {kind}, ") and "90" in line
 
 
-def test_choose_layout_with_hardly_a_gain_stays_in_one_process(speeds):
+def test_choose_layout_stays_in_one_process_if_the_gain_is_small(speeds):
     speeds |= {Layout(0, 2): 70.0, Layout(1, 1): 71.0, Layout(1, 2): 72.0}
     assert choose_layout(auto()).collector.kind == "single"
 
@@ -80,7 +80,7 @@ def test_choose_layout_refuses_several_seeds():
         choose_layout(auto("seeds=[0,1]"))
 
 
-def test_a_run_in_a_layout_that_was_tried_out_is_the_run_with_those_settings(monkeypatch, tmp_path):
+def test_run_after_choose_layout_equals_the_run_with_those_settings(monkeypatch, tmp_path):
     monkeypatch.setattr(layout, "available_cores", lambda: 2)
     monkeypatch.setattr(layout, "CLEARLY_FASTER", 1e9)  # both are tried, the first is taken
     chosen = choose_layout(auto("threads=1", f"run_dir={tmp_path}/auto"), seconds=0.01)

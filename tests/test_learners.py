@@ -36,7 +36,7 @@ def groups(weights):
 @pytest.mark.parametrize(
     "unused", [lambda step: None, lambda step: 1, lambda step: step % 3], ids=["none", "1", "turns"]
 )
-def test_a_step_along_gradients_is_adams_step(unused):
+def test_step_along_equals_adam(unused):
     ours, theirs = parameters(), parameters()
     optimizer = GradientAdam(groups(ours), fused=True)
     reference = Adam(groups(theirs), fused=True)
@@ -53,7 +53,7 @@ def test_a_step_along_gradients_is_adams_step(unused):
     assert unused(0) != 1 or (ours[1] == parameters()[1]).all()
 
 
-def test_a_gradient_and_a_loaded_moment_lie_as_the_parameter_does():
+def test_strides_of_gradients_and_loaded_moments_do_not_matter():
     turned = torch.nn.Parameter(torch.arange(6.0).view(3, 2).t())
     plain = torch.nn.Parameter(turned.detach().contiguous())
     optimizers = [GradientAdam([weight], lr=0.1, fused=True) for weight in (turned, plain)]
@@ -69,7 +69,7 @@ def test_a_gradient_and_a_loaded_moment_lie_as_the_parameter_does():
     torch.testing.assert_close(turned, plain)
 
 
-def test_a_loaded_optimizer_keeps_what_a_cuda_graph_reads():
+def test_loading_keeps_the_learning_rate_tensor_of_a_cuda_graph():
     rate = torch.tensor(0.5)
     optimizer = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=rate, capturable=True)
     of_a_cpu = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.25, fused=True)
@@ -78,7 +78,7 @@ def test_a_loaded_optimizer_keeps_what_a_cuda_graph_reads():
     assert group["lr"] is rate and rate == 0.25 and group["capturable"]
 
 
-def test_rates_go_on_as_they_were_saved():
+def test_state_dict_round_trip_keeps_scaled_rates():
     saved, loaded = (
         GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.2, fused=True) for _ in range(2)
     )
@@ -87,7 +87,7 @@ def test_rates_go_on_as_they_were_saved():
     assert loaded.rates == [group["lr"] for group in loaded.param_groups] == [0.1]
 
 
-def test_an_ema_past_its_warm_up_is_pytorchs_and_copies_buffers():
+def test_ema_after_warm_up_equals_pytorchs_and_copies_buffers():
     model = torch.nn.BatchNorm1d(2)
     ours = WarmedUpEMA(model, decay=0.3)
     theirs = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(0.3))
@@ -112,7 +112,7 @@ def test_batches_may_have_any_size():
         stage.learner.update(stage.sample()[:size])
 
 
-def test_updates_on_several_batches_are_those_on_each_in_turn():
+def test_updates_on_several_batches_equal_updates_in_turn():
     at_once, in_turn = learn_stage(), learn_stage()
     fill(at_once)
     batches = at_once.samples(3)
@@ -139,7 +139,7 @@ class Measures(Transform):
         return batch.set(("next", "reward"), paid.expand(*batch.shape, 1))
 
 
-def test_targets_that_a_transform_reads_follow_all_the_same():
+def test_target_network_is_updated_when_a_transform_reads_the_loss():
     spec = Bounded(-1, 1, shape=(2,))
     loss = BehavioralMetricLoss(StateEncoder(3, 2, hidden=(8,)))
     learner = SACLearner(

@@ -31,18 +31,18 @@ def layouts(rows: int, columns: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("bias", [None, torch.linspace(-1, 1, 24)])
 @pytest.mark.parametrize("left", layouts(1, 1))
 @pytest.mark.parametrize("right", layouts(1, 1))
-def test_a_product_has_the_numbers_of_pytorch(left, right, bias):
+def test_product_equals_pytorchs(left, right, bias):
     a, b = layouts(32, 20)[left], layouts(20, 24)[right]
     expected = a @ b if bias is None else torch.addmm(bias, a, b)
     torch.testing.assert_close(product(a, b, bias), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_only_with_avx_512_are_products_replaced(capability):
+def test_products_are_replaced_only_with_avx_512(capability):
     assert bool(faster_products()) == (capability == "AVX512")
 
 
 @pytest.mark.slow
-def test_a_compiled_graph_of_large_and_small_products_has_the_same_gradients(capability):
+def test_compiled_gradients_of_large_and_small_products_equal_eager_ones(capability):
     features = torch.randn(64, 33)
     weights = [
         torch.randn(n, m).div(m**0.5).requires_grad_() for n, m in ((40, 66), (40, 40), (1, 40))

@@ -75,7 +75,7 @@ def assert_gradients_are_those_of_each(learners, batches):
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-def test_gradients_of_stacked_learners_are_those_of_each(make):
+def test_stacked_gradients_equal_those_of_each_learner(make):
     stages = [make(f"seed={seed}") for seed in SEEDS]
     for stage in stages:
         fill(stage)
@@ -84,7 +84,7 @@ def test_gradients_of_stacked_learners_are_those_of_each(make):
     assert_gradients_are_those_of_each([stage.updated for stage in stages], batches)
 
 
-def test_stacked_learners_have_each_its_own_groups_of_muscles():
+def test_stacked_dynsyn_learners_keep_their_muscle_groups():
     spec = Bounded(torch.tensor([-1.0, 0.0, -3.0, 0.1]), torch.tensor([1.0, 1.0, 5.0, 0.7]))
     learners, batches = [], []
     for groups in ([0, 1, 0, 1], [0, 0, 1, 1]):
@@ -100,7 +100,7 @@ def test_stacked_learners_have_each_its_own_groups_of_muscles():
     assert_gradients_are_those_of_each(learners, batches)
 
 
-def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
+def test_stacked_updates_equal_updates_of_each_learner():
     ours = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
     theirs = [learn_stage(None, f"seed={seed}") for seed in SEEDS]
     for one, other in zip(ours, theirs, strict=True):
@@ -129,7 +129,7 @@ def test_an_update_moves_each_learner_by_its_own_batch_and_random_numbers():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
-def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, traced_only):
+def test_traced_gradients_of_stacked_learners_equal_eager_ones(name, traced_only):
     normalized = ("learn.sac.normalize_observations=true", "actor.hidden=[16,16]")
     stages = [MAKERS[name](f"seed={seed}", *normalized) for seed in SEEDS]
     for stage in stages:
@@ -152,7 +152,7 @@ def test_the_pass_is_traced_as_one_graph_with_each_learner_s_own_tensors(name, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(name, traced_only):
+def test_compiled_update_reads_weights_loaded_after_tracing(name, traced_only):
     stage = MAKERS[name]("actor.hidden=[16,16]")
     fill(stage)
     learner = stage.updated
@@ -168,7 +168,7 @@ def test_a_compiled_update_reads_what_was_loaded_or_changed_since_it_was_traced(
             torch.testing.assert_close(found, expected)
 
 
-def test_finding_out_what_is_drawn_draws_nothing():
+def test_first_call_of_inputs_consumes_no_extra_random_numbers():
     stage = learn_stage()
     fill(stage)
     batch, learner = stage.sample(), stage.learner
@@ -215,7 +215,7 @@ def told_of(network, **options):
     return transform
 
 
-def test_a_transform_has_its_own_network_random_numbers_and_statistics_beside_others():
+def test_transforms_of_stacked_learners_share_no_state():
     learners, inputs = paid_learners(lambda: told_of(torch.nn.Linear(3, 1)))
     alone = [
         learner.loss(own[0])[1]["loss_qvalue"]
@@ -228,13 +228,13 @@ def test_a_transform_has_its_own_network_random_numbers_and_statistics_beside_ot
         assert calls == 2 and not calls.requires_grad
 
 
-def test_a_transform_that_reads_a_network_of_another_seed_is_refused():
+def test_transform_with_an_undeclared_network_is_refused():
     learners, inputs = paid_learners(lambda: Pays(torch.nn.Linear(3, 1)))
     with pytest.raises(ValueError, match="Pays gives another reward than alone"):
         SideBySide(learners).updates(inputs)
 
 
-def test_a_reward_that_is_the_same_everywhere_is_no_fault():
+def test_constant_reward_is_accepted():
     def make():
         network = torch.nn.Linear(3, 1)
         torch.nn.init.zeros_(network.weight)
@@ -244,7 +244,7 @@ def test_a_reward_that_is_the_same_everywhere_is_no_fault():
     SideBySide(learners).updates(inputs)
 
 
-def test_learners_whose_synergy_models_differ_in_their_updates_are_refused():
+def test_synergy_models_with_different_update_counts_are_refused():
     """As runs that were resumed may: the numbers are in the optimizer, which is saved."""
     fitters = []
     for seed, updates in zip(SEEDS, (1, 2), strict=True):
@@ -261,7 +261,7 @@ def test_learners_whose_synergy_models_differ_in_their_updates_are_refused():
         SideBySide(learners).updates(inputs)
 
 
-def test_learners_of_other_sizes_are_refused():
+def test_learners_of_different_sizes_are_refused():
     small, large = (learn_stage(None, f"actor.hidden=[{width}]") for width in (8, 16))
     with pytest.raises(ValueError, match=r"learners\[1\] has parameters of other shapes"):
         SideBySide([small.learner, large.learner])
@@ -271,7 +271,7 @@ def test_learners_of_other_sizes_are_refused():
 
 
 @pytest.mark.parametrize("setting", ["learn.sac.lr=1e-2", "learn.sac.tau=0.5"])
-def test_learners_of_another_pace_are_refused(setting):
+def test_learners_with_different_rates_are_refused(setting):
     stages = [learn_stage(), learn_stage(None, setting)]
     for stage in stages:
         fill(stage)
