@@ -27,8 +27,8 @@ class LinearDecoder(nn.Module):
 
 
 def test_authority_of_a_linear_decoder_by_hand():
-    # The middle 90 % of U[-1, 1] spans 1.8; actuator 0 covers its range, actuator 1 half of its
-    # own, actuator 2 does not move.
+    # The middle 90 % of U[-1, 1] spans 1.8. Actuator 0 covers its whole range, actuator 1 half of
+    # its range, and actuator 2 does not move.
     decoder = LinearDecoder([[1.0, 2.0, 0.0]], [-1.0, -4.0, 0.0], [1.0, 4.0, 1.0])
     authority = control_authority(decoder, 20_000)
     torch.testing.assert_close(authority, torch.tensor([0.9, 0.45, 0.0]), atol=0.01, rtol=0)

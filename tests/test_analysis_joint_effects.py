@@ -1,4 +1,4 @@
-"""joint_effects, by hand."""
+"""joint_effects against values worked out by hand."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from torchrl_etl.analysis import joint_effects
 
-# Two joints and four muscles: a pair of opponents at each.
+# Two joints and four muscles: a pair of antagonists at each joint.
 TORQUES = np.array([[3.0, -3.0, 0.0, 0.0], [0.0, 0.0, 0.5, -0.5]])
 
 
@@ -22,8 +22,8 @@ def test_opposed_changes_turn_joints_and_co_contraction_does_not():
 def test_single_muscle_has_share_one_half_and_gain_one():
     alone = np.array([[0.0, 0.4, 0.4, 0.4], [1.0, 0.4, 0.4, 0.4]])
     effects = joint_effects(alone, TORQUES)
-    # Its direction (1, 0, 0, 0) has the share 1/2 along (1, -1, 0, 0) / √2. Rows of unit length
-    # have four entries of 1/√2, of which a muscle meets one: the torque variance of chance.
+    # The squared projection of (1, 0, 0, 0) on the joint's row (1, -1, 0, 0) / √2 is 1/2. Each of
+    # the four muscles has one entry of ±1/√2, so one muscle has the torque variance of chance.
     assert effects.share == pytest.approx(0.5)
     assert effects.gain == pytest.approx(1.0)
 

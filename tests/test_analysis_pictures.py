@@ -1,4 +1,4 @@
-"""Pictures are drawn from the data that runs have, whole or not at all."""
+"""Pictures are drawn from the data that runs write; a failed one keeps the old file."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""Published curves are of our tasks and come with what differs."""
+"""Published curves belong to known tasks and come with caveats about what differs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_published_rows_belong_to_known_tasks():
 
 def test_published_best_and_caveats():
     assert best_published("dog-run", 100_000) == (118.33, "XQC")
-    # Between the published points, linearly: XQC has 310.14 and 449.96.
+    # Interpolated between the published points of XQC, 310.14 and 449.96.
     value, algorithm = best_published("dog-run", 400_000)
     assert (value, algorithm) == (pytest.approx((310.14 + 449.96) / 2), "XQC")
     assert best_published("dog-run", 50_000) is best_published("myoLegWalk-v0", 100_000) is None

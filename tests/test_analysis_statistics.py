@@ -1,4 +1,4 @@
-"""Intervals are deterministic, defined for degenerate data, and cover what they should."""
+"""Intervals are deterministic, defined for degenerate data, and have their nominal coverage."""
 
 import math
 
@@ -12,7 +12,7 @@ def test_interval_has_nominal_coverage():
     rng = np.random.default_rng(0)
     samples = rng.exponential(2.0, size=(60, 30))
     hits = sum(low <= 2.0 <= high for _, low, high in map(interval, samples))
-    assert 49 <= hits <= 60  # 95 % of 60 is 57; skewed data of 30 cost a little
+    assert 49 <= hits <= 60  # nominal: 95 % of 60 = 57; a little lower for 30 skewed values
 
 
 def test_interval_is_deterministic_and_widens_with_confidence():

@@ -1,4 +1,4 @@
-"""A sweep's report says what its rows say, in tables and pictures."""
+"""The report of a sweep: its tables, its pictures and its messages."""
 
 from __future__ import annotations
 

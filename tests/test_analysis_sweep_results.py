@@ -1,4 +1,4 @@
-"""What a sweep's file says is read row by row, and what it cannot say is named."""
+"""read_sweep turns the rows of results.csv into runs, and names a bad cell, column or file."""
 
 from __future__ import annotations
 

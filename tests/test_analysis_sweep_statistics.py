@@ -1,4 +1,4 @@
-"""Comparisons at an equal number of frames: no fake interval, no borrowed number."""
+"""Methods compared at an equal number of frames, and scores normalized over tasks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_budget_is_the_largest_that_all_runs_reached(tmp_path):
     assert comparison.result("etl").returns.tolist() == [5.0]
     assert comparison.result("etl").improvement == 1.0
     assert comparison.result("sac").improvement is None and not comparison.stale
-    # A grid that never meets the other's: the last evaluation counts, and is named.
+    # At other frames than etl's: sac's last evaluation before the budget counts, marked as stale.
     runs = sweep(tmp_path, sac, run([0, 4, 8], [0, 30_000, 80_000], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", repetitions=FEW)
     assert comparison.budget == 80_000 and comparison.result("sac").returns.tolist() == [1.0]
@@ -63,7 +63,7 @@ def test_frames_to_the_controls_return_use_the_mean_over_seeds(tmp_path):
 
 
 def test_overall_iqm_with_unequal_seeds_and_a_missing_task(tmp_path):
-    """By hand. Key Turn at 100,000: zero −100, one 2211.99 (FlashSAC). Leg Walk: one is SAC's."""
+    """Key Turn is scaled from -100 to FlashSAC's 2211.99, Leg Walk from -50 to SAC's 50."""
     turn = [run([-100, 0, 2211.99], method="sac", seed=s) for s in (0, 1, 2)]
     better = [run([-100, 0, 2211.99 + 2311.99], method="etl", seed=s) for s in (0, 1)]
     walk = [run([-50, 0, 50], task="myoLegWalk", seed=s) for s in (0, 1)]

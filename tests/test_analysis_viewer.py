@@ -1,4 +1,4 @@
-"""What the viewer's buttons do, without a browser."""
+"""What the controls of the viewer do, without a browser."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def make_decoder(residual: float = 0.0) -> SynergyDecoder:
 
 
 def acting(value: float, decoder: SynergyDecoder) -> TensorDictSequential:
-    """A policy that always emits one number in all entries, and decodes it."""
+    """A policy whose coefficients all have one value, followed by the decoder."""
 
     def emit(observation: torch.Tensor) -> torch.Tensor:
         return observation.new_full((*observation.shape[:-1], decoder.synergy_dim), value)
@@ -205,7 +205,7 @@ def test_sliders_move_joints_while_the_root_is_held():
         assert session.data.qpos[2] != place[2]
 
 
-# A body of its own: a motor on a hinge, and a muscle whose tendon runs straight up.
+# A small body: a motor on a hinge, and a muscle whose tendon runs straight up.
 BODY = """
 <mujoco>
   <worldbody>

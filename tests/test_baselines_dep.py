@@ -1,4 +1,4 @@
-"""DEP: the equations of its controller against numbers worked by hand."""
+"""DEP: the equations of its controller against numbers worked out by hand."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MUSCLES = 3
 SPEC = Bounded(0, 1, shape=(MUSCLES,))
 
 
-# A joint at these angles, which two antagonists follow: one is as long as the other is short.
+# Angles of a joint with two antagonists, whose lengths are the angle and its negative.
 ANGLES = (0.0, 0.9, 0.4, 0.6)
-# Sensors over a range of 0.9 + 0.1 = 1 are s1 = 2a - 1 and s2 = 0.8 - 2a, but for the first angle,
-# where the range is 0.1 and each length at its lower end.
+# From the second angle a on the range is 0.9 + 0.1 = 1, so the sensors are 2a - 1 and 0.8 - 2a. At
+# the first the range is 0.1 and both lengths are at its lower end.
 SENSORS = ((-1.0, -1.0), (0.8, -1.0), (-0.2, 0.0), (0.2, -0.4))
 MOVES = ((0.0, 0.0), (1.8, 0.0), (-1.0, 1.0), (0.4, -0.4))
 
@@ -61,8 +61,8 @@ def test_matrix_of_two_antagonists() -> None:
 
 @pytest.mark.parametrize(
     ("normalize", "expected"),
-    # The rows of C have lengths 5 and 13: of the paper each row becomes a unit vector, of the
-    # public code the first column is divided by 5 and the second by 13.
+    # The rows of C have lengths 5 and 13. In the paper each row becomes a unit vector; the public
+    # code divides the first column by 5 and the second by 13.
     [
         ("rows", [[3 / 5, 4 / 5], [5 / 13, -12 / 13]]),
         ("columns", [[3 / 5, 4 / 13], [5 / 5, -12 / 13]]),

@@ -1,4 +1,4 @@
-"""DEP: when it takes the policy's place, and in a collector."""
+"""DEP: when it replaces the policy's actions, alone and in a collector."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_bursts_last_exactly_intervention_length(length: int) -> None:
 
 
 def test_bursts_begin_with_the_given_probability() -> None:
-    """A policy's step begins a burst with p: bursts per policy's step are p, within 3 sigma."""
+    """Bursts per step of the policy are the probability p, within 3 sigma."""
     p, rows, steps = 0.02, 50, 300
     acted = replaced(DEPExploration(SPEC, dep_frames=0, probability=p), steps, rows)
     begins = (acted[1:] & ~acted[:-1]).sum().item()
@@ -125,7 +125,7 @@ def test_dep_is_inactive_unless_exploration_is_random(
 
 
 def test_controller_adapts_while_the_policy_acts() -> None:
-    """The action of a burst is the one of a controller that saw every step."""
+    """The action of a burst is that of a controller that saw every step."""
     module = DEPExploration(SPEC, dep_frames=0, probability=0.0)
     alone = DEPController(2, MUSCLES)
     for step in range(30):
@@ -210,7 +210,7 @@ def test_new_batch_size_resets_the_controller_and_keeps_the_frame_count() -> Non
     module = DEPExploration(SPEC, dep_frames=20, probability=0.0)
     replaced(module, 10, rows=2)
     assert module.controller.moves.any()
-    assert not replaced(module, 1, rows=3).any()  # the frames that were DEP's are over
+    assert not replaced(module, 1, rows=3).any()  # the initial frames of DEP are over
     assert module.controller.rows == 3 and module.frames == 23
     assert not module.controller.moves.any()
 
@@ -291,7 +291,7 @@ def test_collector_records_deps_actions(collector_class: type[Collector]) -> Non
 
 
 def test_dep_leaves_the_gradient_of_the_actor_intact() -> None:
-    """DEP replaces what was sampled, and leaves alone what the loss evaluates."""
+    """DEP replaces the sampled action and leaves the distribution that the loss evaluates."""
     actor = make_actor({"observation": 2}, SPEC, hidden=(8,))
     policy = TensorDictSequential(actor, DEPExploration(SPEC))
     td = TensorDict({"observation": torch.randn(4, 2), "muscle_length": torch.rand(4, 3)}, [4])

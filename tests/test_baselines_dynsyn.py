@@ -59,7 +59,7 @@ def grouped(amplitude: float = 0.1, rows: int = 50, **bounds: Tensor) -> Grouped
 
 
 def weights_of(action: Tensor) -> Tensor:
-    """Each member's action over its group's first's, where bounds are ±1."""
+    """Each member's action divided by that of its group's first member, where bounds are ±1."""
     first = MuscleGroups.of(GROUPS).first
     return action / action[..., first[torch.tensor(GROUPS)]]
 
@@ -98,8 +98,8 @@ def test_weights_by_hand() -> None:
 
 
 def test_deviations_have_the_papers_standard_deviation() -> None:
-    # 0.1 tanh N(μ, e^½): the inverse of the weights is that Gaussian. In double precision weights
-    # near ±10 % can still be told apart.
+    # Weights are 1 + 0.1 tanh v with v Gaussian of mean μ and deviation e^½, so inverting them
+    # gives v. Double precision resolves weights near ±10 %.
     mu = torch.tensor([0.4, -0.3, 0.0], dtype=torch.float64)
     dist = GroupedTanhNormal(
         torch.zeros_like(mu),
@@ -140,7 +140,7 @@ def test_actions_stay_within_each_muscles_bounds() -> None:
     assert (action >= LOW).all() and (action <= HIGH).all()
     torch.testing.assert_close(action.amin((0, 1)), LOW, atol=1e-3, rtol=0)
     torch.testing.assert_close(action.amax((0, 1)), HIGH, atol=1e-3, rtol=0)
-    # A group's members sit at the same height between bounds of their own.
+    # Members of a group are at nearly the same height between their bounds.
     height = (dist.deterministic_sample - LOW) / (HIGH - LOW)
     torch.testing.assert_close(height[:, 4], height[:, 1], atol=0.06, rtol=0)
 
@@ -264,7 +264,7 @@ def test_policy_on_arrays_matches_the_actor() -> None:
     actor, data = actor_on(), observations(3)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         on_arrays = PolicyOnArrays(actor)
-        for frames in (0, 3_000_000):  # the traced graph reads the buffer anew
+        for frames in (0, 3_000_000):  # the traced graph reads the buffer at each call
             set_frames(actor, frames)
             action = on_arrays({"observation": data["observation"].numpy()})["action"]
             expected = actor(data.clone())["action"]

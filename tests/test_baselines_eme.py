@@ -1,4 +1,4 @@
-"""EME: the loss, its check list, numbers and fixed point."""
+"""EME: its loss against the check list of losses, values worked out by hand and a fixed point."""
 
 # ruff: noqa: RUF012  (class attributes that configure a check list are constants)
 
@@ -29,7 +29,7 @@ K = 3
 
 
 def fixed(build: Any, *args: Any, **kwargs: Any) -> Any:
-    """The same weights whatever the seed, in every process."""
+    """``build(...)`` with the same weights in every process, whatever the seed."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         return build(*args, **kwargs)
@@ -53,7 +53,7 @@ class TestEMELoss(LossChecks):
         encoder = StateEncoder(OBSERVATION_DIM, K, hidden=hidden, in_keys=[at("observation")])
         keys = [at("observation"), at("action")]
         ensemble = RewardEnsemble(OBSERVATION_DIM, ACTION_DIM, 4, hidden=hidden, in_keys=keys)
-        # Its weights are no part of the loss's state.
+        # The actor is not in the loss's state dict, so its weights must not depend on the seed.
         actor = fixed(
             make_actor,
             {at("observation"): OBSERVATION_DIM},
@@ -61,7 +61,7 @@ class TestEMELoss(LossChecks):
             hidden=hidden,
         )
         with torch.no_grad():
-            actor[0].module[-2].weight.mul_(100)  # actors are made to start nearly constant
+            actor[0].module[-2].weight.mul_(100)  # a new actor is nearly constant
         loss = EMELoss(encoder, ensemble, actor, **self.options | kwargs)
         if nested:
             loss.set_keys(reward=at("reward"), terminated=at("over"))
@@ -183,7 +183,7 @@ def test_targets_of_three_rows_by_hand(policy_weight: float) -> None:
         D01 - (1 + 0.5 * D12 + policy_weight * kl(1, 0)),
         D12 - (4 + 0.5 * D02 + policy_weight * kl(2, 1)),
     ]
-    # Three samples can be paired in two ways only, so that none meets itself.
+    # Three samples have only two pairings in which none meets itself.
     expected = [torch.tensor(errors).square() for errors in (onward, backward)]
     seen = set()
     for _ in range(20):
@@ -231,7 +231,7 @@ def test_random_subsets_keep_the_expected_ensemble_loss() -> None:
     whole = loss_of_tables(reduction="none")(data)["loss_reward_ensemble"]
     part = loss_of_tables(subset_share=0.25, reduction="none")(data)["loss_reward_ensemble"]
     assert part.mean().item() == pytest.approx(whole.mean().item(), rel=0.05)
-    # Of two members with error 1: both, one or none has drawn a sample, at weight 4.
+    # Of two members with error 1, a sample is drawn by both, one or none, with weight 4.
     assert set(part.tolist()) == {0.0, 2.0, 4.0}
     assert (part == 4.0).float().mean().item() == pytest.approx(1 / 16, abs=0.02)
 

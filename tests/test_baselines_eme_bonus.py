@@ -1,4 +1,4 @@
-"""EME: the bonus, its check list and numbers."""
+"""EME: its bonus against the check list of transforms and values worked out by hand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def fixed_networks() -> tuple[StateEncoder, RewardEnsemble]:
     ensemble = fixed(RewardEnsemble, OBSERVATION_DIM, ACTION_DIM, 3, hidden=(8,))
     with torch.no_grad():
         for parameter in ensemble.parameters():
-            parameter.mul_(6)  # so that they disagree by more than the scale's floor
+            parameter.mul_(6)  # so that their variance exceeds the lower bound of the scale
     return encoder, ensemble
 
 
@@ -84,7 +84,7 @@ class TestEMEBonus(TransformChecks):
     @pytest.mark.parametrize("appended", [False, True])
     def test_replay_buffer(self, appended: bool) -> None:
         transform = bonus_of_tables()
-        # So many draws of two rows that both are among them.
+        # 64 draws of two rows contain both.
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(8), batch_size=64, transform=None if appended else transform
         )

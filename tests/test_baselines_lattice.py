@@ -1,4 +1,4 @@
-"""Lattice's actor, alone and in SAC."""
+"""Lattice: its actor, alone and in SAC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lattice's covariance and its squashed density."""
+"""Lattice: its covariance and its squashed density."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lattice: noise that is kept."""
+"""Lattice: exploration noise that is held for several steps."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_no_noise_unless_exploring(kind: ExplorationType) -> None:
     expected = policy.actor.get_dist(data.clone()).deterministic_sample
     torch.testing.assert_close(silent, expected)
     assert not torch.allclose(loud, silent)
-    assert torch.equal(policy(data.clone())["action"], loud)  # nor was any noise used up
+    assert torch.equal(policy(data.clone())["action"], loud)  # the held noise is unchanged
 
 
 def test_held_noise_replaces_the_actors_sample() -> None:

@@ -1,4 +1,4 @@
-"""DynSyn: groups of muscles, found and found again."""
+"""DynSyn: recording muscle lengths, and clustering muscles into groups."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GROUPS = [0, 1, 0, 2, 1, 0]
 
 
 def planted(frames: int = 600, noise: float = 0.01, seed: int = 0) -> Tensor:
-    """Six muscles on three joints, in GROUPS; each in its own units, some a little off."""
+    """Noisy lengths of six muscles on three joints, in GROUPS, each in its own units."""
     generator = torch.Generator().manual_seed(seed)
     walk = torch.randn(frames, 3, generator=generator).cumsum(0)
     lengths = walk[:, GROUPS] * torch.tensor([1.0, 1.0, 0.1, 3.0, 7.0, 2.0]) + torch.arange(6.0)
@@ -161,7 +161,7 @@ def test_recording_keeps_objects_in_place_on_any_joint_type(joints: str) -> None
     record_muscle_lengths(GymWrapper(inner), 30, amplitude=50.0, every=3)
     arm, objects = np.abs(inner.data.qvel[:1]), np.abs(np.stack(inner.after)[:, 1:])
     assert arm > 0.2 and not np.abs(np.stack(inner.velocities)[:, 1:]).any()
-    assert objects.max() < 0.3  # what gravity does in a step, and no blow of the arm
+    assert objects.max() < 0.3  # gravity during one step, and no collision with the arm
     assert (colliding[0] == inner.model.geom_contype).all()
     assert (colliding[1] == inner.model.geom_conaffinity).all()
 

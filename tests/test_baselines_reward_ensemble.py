@@ -1,4 +1,4 @@
-"""The reward ensemble and how much its members disagree."""
+"""The reward ensemble and the scale from the variance of its members."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SAR: its basis against scikit-learn's own way back, and where its decoder must fit in."""
+"""SAR: its basis against scikit-learn's transforms, and its decoder in transforms and losses."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MUSCLES, SYNERGIES = 7, 3
 
 
 def sources(rows: int = 500) -> Tensor:
-    """Independent and not Gaussian, so that there is something to separate."""
+    """Independent, non-Gaussian sources, which ICA can separate."""
     return torch.rand(rows, SYNERGIES, dtype=torch.float64) * 2 - 1
 
 
 def planted(rows: int = 500, noise: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
-    """Actions of three sources, the mixing [3, n] and the middle [n]."""
+    """Actions of three sources, their mixing matrix [3, n] and the mean [n]."""
     mixing = torch.randn(SYNERGIES, MUSCLES, dtype=torch.float64) * 0.2
     middle = torch.rand(MUSCLES, dtype=torch.float64) * 0.4 - 0.2
     actions = middle + sources(rows) @ mixing
@@ -77,7 +77,7 @@ def test_planted_synergies_are_found() -> None:
     found = torch.nn.functional.normalize(decoder.module.basis, dim=-1)
     cosines = (found @ torch.nn.functional.normalize(mixing, dim=-1).T).abs()
     assert (cosines.amax(1) > 0.98).all() and len(set(cosines.argmax(1).tolist())) == 3
-    # Sources span [-1, 1], and so do coefficients.
+    # Sources and coefficients both span [-1, 1].
     planted_sizes = mixing.norm(dim=-1)[cosines.argmax(1)]
     torch.testing.assert_close(decoder.module.basis.norm(dim=-1), planted_sizes, rtol=0.1, atol=0)
     torch.testing.assert_close(decoder.module.mean, middle, rtol=0, atol=0.05)
@@ -226,7 +226,7 @@ def test_actions_that_cannot_be_fitted_are_refused() -> None:
         SARDecoder.fit(actions, 0)
 
 
-# Where a synergy decoder goes --------------------------------------------------------------------
+# In transforms, losses and stage 2 ---------------------------------------------------------------
 
 
 def overactuated_decoder(blend: float) -> SARDecoder:

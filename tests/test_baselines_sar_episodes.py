@@ -1,4 +1,4 @@
-"""Which episodes SAR takes its actions from."""
+"""The episodes whose actions SAR is fitted to."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchrl_etl.baselines.sar import best_episodes
 
 
 def rows_of(returns: list[float], steps: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Actions that are the number of their episode, with returns and episode numbers."""
+    """Actions equal to their episode's number, their returns and the episode numbers."""
     episodes = torch.arange(len(returns)).repeat_interleave(torch.tensor(steps))
     return episodes.float().unsqueeze(-1), torch.tensor(returns)[episodes], episodes
 
