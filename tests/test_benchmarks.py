@@ -1,4 +1,4 @@
-"""What ``make bench`` reports: its page, its lines, the products it counts, its peers."""
+"""``make bench``: its page, its result lines, the products it counts and its peers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ NAMES = ("bench", "end_to_end", "floor", "harness", "machine", "peers", "seeds",
 
 @pytest.fixture(scope="module")
 def benchmarks() -> Iterator[SimpleNamespace]:
-    """Its modules, imported as its scripts import them."""
+    """The modules of the folder, imported as its scripts import them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(FOLDER)
-        patch.setenv("OMP_NUM_THREADS", "1")  # as some of them set it for good
+        patch.setenv("OMP_NUM_THREADS", "1")  # which some of them set for the whole process
         modules = {name: __import__(name) for name in NAMES}
         yield SimpleNamespace(**modules)
         for name in modules:
@@ -82,7 +82,7 @@ def test_machine_facts_name_the_cpu_and_its_vector_instructions(
 def test_floor_lists_the_matrix_products_of_an_mlp(benchmarks):
     products = benchmarks.floor.products(5, [2, 3, 1], "fwh")
     forward, weights = [(5, 2, 3), (5, 3, 1)], [(2, 5, 3), (3, 5, 1)]
-    assert list(products) == [*forward, *weights, (5, 1, 3)]  # none to the input
+    assert list(products) == [*forward, *weights, (5, 1, 3)]  # no gradient of the input
 
 
 def test_updates_are_timed_as_training_makes_them(benchmarks):
@@ -109,7 +109,7 @@ def test_seeds_are_timed_as_training_updates_them_together(benchmarks, monkeypat
     values = benchmarks.seeds.measured(stages, repeats=1, block=4)
     for stage in stages:
         stage.close()
-        assert stage.progress.updates == 2 * (4 + 4)  # a block before the one that is recorded
+        assert stage.progress.updates == 2 * (4 + 4)  # a warm-up block and the recorded one
     assert calls == [2, 2] * 2
     assert [len(each) for each in values.values()] == [1, 1]
     assert min(values["together"] + values["one_by_one"]) > 0

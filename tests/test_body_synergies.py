@@ -1,4 +1,4 @@
-"""Synergies of a body's moment arms, and the scripts that lay others beside them."""
+"""Synergies from a body's moment arms, and the studies that compare others with them."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ TASK = "myoHandKeyTurn"
 
 
 def test_each_synergy_turns_one_joint_with_a_largest_change_of_one():
-    # Two opponents at the first joint, and a muscle over both joints.
+    # Two antagonists at the first joint, and a muscle over both joints.
     torques = np.array([[2.0, -2.0, 1.0], [0.0, 0.0, 3.0]])
     changes = muscle_changes(torques)
     turned = changes @ torques.T
     assert turned[~np.eye(2, dtype=bool)] == pytest.approx(0.0, abs=1e-12)
     assert (np.diag(turned) > 0).all()
-    # By hand: (1/2, -1/2, 0) turns the first joint; the second takes the third muscle, whose pull
-    # on the first the two opponents hold: (-1/4, 1/4, 1).
+    # By hand: (1/2, -1/2, 0) turns the first joint. The third muscle turns the second joint, and
+    # the antagonists cancel its torque on the first: (-1/4, 1/4, 1).
     assert changes == pytest.approx(np.array([[1.0, -1.0, 0.0], [-0.25, 0.25, 1.0]]))
 
 
 def test_fewer_synergies_are_those_of_the_largest_torques():
-    # The same two muscles turn the first two joints; a third turns the last.
+    # The first two muscles turn the first two joints, and the third muscle turns the last joint.
     torques = np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 0.0], [0.0, 0.0, 9.0]])
     (change,) = muscle_changes(torques, 1)
     assert np.abs(change) == pytest.approx([1.0, 1.0, 0.0])
@@ -103,7 +103,7 @@ def test_studies_write_a_body_bundle_and_rows_of_joint_effects(tmp_path):
     assert float(rows[2]["share"]) > 0.9
     for row in rows:
         assert float(row["shuffled"]) == pytest.approx(float(row["chance"]), abs=0.05)
-        assert 0 < float(row["shuffled_sd"]) < 0.2  # two dimensions scatter by 0.1
+        assert 0 < float(row["shuffled_sd"]) < 0.2  # about 0.1 for two synergies
 
 
 def test_run_with_body_synergies_saves_them_and_resumes(tmp_path):

@@ -1,4 +1,4 @@
-"""The synergy bundle survives the disk bit for bit, or says in one sentence why not."""
+"""Synergy bundles: an exact round trip through the disk, and errors of one sentence."""
 
 import copy
 import hashlib
@@ -29,7 +29,7 @@ LOW, HIGH = [0.0, -1.0, 0.0, 0.1, 0.0], [1.0, 1.0, 2.0, 0.7, 1.0]
 
 
 def actions(rows):
-    """Between the bounds of the decoder."""
+    """Random actions between the bounds of the decoder."""
     low, high = torch.tensor(LOW), torch.tensor(HIGH)
     return low + torch.rand(rows, 5) * (high - low)
 
@@ -94,7 +94,7 @@ def test_loads_from_the_run_folder_with_other_keys_and_residual(bundle):
 
 def test_redundant_num_components_of_an_older_bundle_is_ignored(bundle):
     _, info = load_bundle(bundle)
-    edit(bundle, num_components=3)  # as all once did
+    edit(bundle, num_components=3)  # as older releases wrote
     assert load_bundle(bundle)[1] == info
 
 
@@ -160,7 +160,7 @@ def test_a_pickle_in_disguise_is_refused_without_running(bundle, tmp_path):
 @pytest.mark.parametrize("survives", [0, 1])
 @pytest.mark.parametrize("killed", [False, True], ids=["error", "killed"])
 def test_interrupted_save_keeps_the_old_bundle(bundle, monkeypatch, survives, killed):
-    """``survives`` moves succeed, then one fails; when killed, nothing after it runs either."""
+    """``survives`` moves succeed, then one fails; ``killed``: no clean-up runs after it either."""
     old, new = load_bundle(bundle)[0], fitted_decoder(seed=1)
     calls, replace = [], os.replace
 
@@ -278,7 +278,7 @@ def test_loading_a_non_finite_decoder_is_refused(tmp_path, monkeypatch):
     decoder = SynergyDecoder(2, 3)
     with torch.no_grad():
         next(decoder.parameters()).view(-1)[0] = float("nan")
-    with monkeypatch.context() as patch:  # releases before saved it
+    with monkeypatch.context() as patch:  # earlier releases saved such a decoder
         patch.setattr("torchrl_etl.synergies.bundle.not_finite", lambda state: None)
         save_bundle(decoder, tmp_path / "own", task="toy", actuators=["a", "b", "c"])
     with pytest.raises(BundleError, match="not finite: its training diverged before it was saved"):

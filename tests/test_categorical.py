@@ -1,4 +1,4 @@
-"""Categorical critics: the projection by hand, the target against a plain reading of it."""
+"""Categorical critics: the projection by hand, the target against a loop over rows and atoms."""
 
 from __future__ import annotations
 

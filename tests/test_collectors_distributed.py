@@ -1,4 +1,4 @@
-"""Collector workers in a torch.distributed group: fresh weights, faults, seeds."""
+"""Collector workers in a torch.distributed group: newest weights, faults, seeds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.slow]
 
 @pytest.fixture
 def start():
-    """Starts workers; they are ended with the test."""
+    """A function that starts workers, which end with the test."""
     started = []
 
     def build(env=make_batched_env, **kwargs) -> tuple[DistributedWorkers, torch.nn.Module]:
@@ -145,7 +145,7 @@ def test_bad_arguments_are_named_before_anything_is_started():
         )
     with pytest.raises(ValueError, match="num_workers is 0; it must be a whole number, 1"):
         DistributedWorkers(make_batched_env, policy, num_workers=0, frames_per_batch=8)
-    with pytest.raises(OSError, match="no such model"):  # its own error, not a worker's silence
+    with pytest.raises(OSError, match="no such model"):  # the error itself, not a worker's timeout
 
         def broken():
             raise OSError("no such model")

@@ -1,4 +1,4 @@
-"""Workers in processes: fresh weights, the same frames, faults that end in words."""
+"""Workers in processes: newest weights, the same frames, faults that end in a message."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def policy() -> TensorDictSequential:
 
 
 def decodes_to(policy: TensorDictSequential, value: float) -> None:
-    """Lets the decoder give this action for any synergy."""
+    """Makes the decoder return this action for any synergy."""
     decode_to(policy, math.atanh(value))
 
 
 @pytest.fixture
 def start(policy):
-    """Starts batches of a kind, and closes what was started."""
+    """A function that starts batches of a kind, which are closed with the test."""
     started = []
 
     def start(kind: str, make=make_overactuated, **kwargs):
@@ -55,7 +55,7 @@ def start(policy):
     yield start
     for batches in started:
         batches.close()
-        batches.close()  # again does nothing
+        batches.close()  # a second close does nothing
 
 
 def observations(batches, count: int = 3) -> torch.Tensor:
@@ -70,7 +70,7 @@ def test_worker_process_collects_the_same_frames_as_this_process(start, ahead):
         batches.restart(seed=5)
     first = observations(here)
     assert torch.equal(first, observations(there))
-    for batches in (here, there):  # whatever was under way does not show
+    for batches in (here, there):  # a batch under way is dropped
         batches.restart(seed=5)
     assert torch.equal(first, observations(here))
     assert torch.equal(first, observations(there))
@@ -85,7 +85,7 @@ def test_next_requested_batch_uses_the_newest_decoder(start, policy):
     decodes_to(policy, 0.5)
     assert in_turns.next()["action"].allclose(torch.tensor(0.5))
     under_way, next_one = ahead.next(), ahead.next()
-    assert under_way["action"].std() > 0  # asked for before the change
+    assert under_way["action"].std() > 0  # requested before the change
     assert next_one["action"].allclose(torch.tensor(0.5))
 
 
@@ -95,7 +95,7 @@ def test_batch_uses_the_weights_of_its_request(start, policy):
     batches.restart(seed=0)
     batches.ask()
     decodes_to(policy, 0.5)
-    batches.ask()  # again does nothing
+    batches.ask()  # a second request does nothing
     assert batches.next()["action"].std() > 0
     assert batches.next()["action"].allclose(torch.tensor(0.5))
 
@@ -115,7 +115,9 @@ def test_async_workers_take_new_weights(start, policy):
     batches = start("async", num_workers=2)
     batches.next()
     decodes_to(policy, 0.25)
-    for _ in range(6):  # at most one finished and one begun batch of each worker are older
+    for _ in range(
+        6
+    ):  # each worker has at most one finished and one begun batch with older weights
         batch = batches.next()
     assert batch["action"].allclose(torch.tensor(0.25))
     assert batch.shape == (4, FRAMES // 4)
@@ -123,7 +125,9 @@ def test_async_workers_take_new_weights(start, policy):
 
 @pytest.mark.slow
 def test_episode_numbers_identify_returns_across_workers(start):
-    batches = start("async", num_workers=2, frames_per_batch=4 * 7)  # episodes end within batches
+    batches = start(
+        "async", num_workers=2, frames_per_batch=4 * 7
+    )  # so that episodes end within batches
     returns: dict[int, float] = {}
     for _ in range(12):
         batch = batches.next()
@@ -162,7 +166,7 @@ def test_killed_worker_ends_collection_with_a_message(start, kind):
 
 class Stuck(PointTask):
     def step(self, action):
-        if self.episode > 1 and self.age == 2:  # not while it is being built
+        if self.episode > 1 and self.age == 2:  # not while the environment is built
             time.sleep(3600)
         return super().step(action)
 
@@ -227,8 +231,8 @@ def test_workers_of_a_killed_learner_end_too(tmp_path):
     pytest.fail("the worker lives on")
 
 
-class Gathered:
-    """Workers that are there once all the others are."""
+class StartTogether:
+    """Workers whose start waits until all of them start."""
 
     def __init__(self, there: threading.Barrier) -> None:
         there.wait(20)
@@ -242,23 +246,23 @@ class Gathered:
 
 def test_collectors_start_their_workers_in_parallel():
     there = threading.Barrier(2)
-    several = [Batches(partial(Gathered, there)) for _ in range(2)]
+    several = [Batches(partial(StartTogether, there)) for _ in range(2)]
     for batches in several:
         batches.await_start()
     for batches in several:
         batches.close()
 
 
-def never_there():
+def fails_to_start():
     raise RuntimeError("no simulator")
 
 
 def test_failed_start_raises_in_await_start_and_can_be_closed():
-    batches = Batches(never_there)
+    batches = Batches(fails_to_start)
     with pytest.raises(CollectionError, match="did not start: no simulator"):
         batches.await_start()
     batches.close()
-    Batches(never_there).close()
+    Batches(fails_to_start).close()
 
 
 def test_single_cannot_run_ahead():

@@ -1,4 +1,4 @@
-"""Collector workers on a Ray cluster: fresh weights, faults, seeds. Two nodes, on this machine."""
+"""Collector workers on a local Ray cluster of two nodes: newest weights, faults, seeds."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def address() -> str:
 
 @pytest.fixture
 def start(address):
-    """Starts workers on the cluster; they are ended with the test."""
+    """A function that starts workers on the cluster, which end with the test."""
     started = []
 
     def build(**kwargs) -> tuple[RayWorkers, torch.nn.Module]:
@@ -55,7 +55,7 @@ def start(address):
 
 
 def inside(collector: RayWorkers, worker: int, what) -> object:
-    """What a function of the worker's collector returns there."""
+    """The result of a function of the worker's collector, called in the worker."""
     return ray.get(collector.remote_collectors[worker].__ray_call__.remote(what), timeout=30)
 
 
@@ -108,9 +108,9 @@ def test_replacement_of_a_killed_worker_has_the_newest_weights(start, sync):
     collector.update_policy_weights_()
     killed = pid(collector, 0)
     os.kill(killed, signal.SIGKILL)
-    while collector.started == 2:  # until it is noticed
+    while collector.started == 2:  # until the loss is noticed
         seen.append(next(batches))
-    while not sync and origin(seen[-1], "worker") != 0:  # the other one goes on in the meantime
+    while not sync and origin(seen[-1], "worker") != 0:  # the other worker goes on in the meantime
         seen.append(next(batches))
         time.sleep(0.1)
     assert was_decoded_by(seen[-1], policy)

@@ -1,4 +1,4 @@
-"""The fast collector against TorchRL's own, transition by transition."""
+"""VectorCollector against TorchRL's Collector, transition by transition."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PLAIN = {"trust_policy": True, "auto_register_policy_transforms": False}
 
 
 def parts(name: str, mode: str, num_envs: int = 3, **kwargs):
-    """A maker of the environment of a stage, and a policy for it."""
+    """A function that makes the environment of a stage, and a policy for it."""
     make = partial(make_env, name, num_envs=num_envs, **kwargs)
     env = make()
     spec = env.full_action_spec_unbatched["action"]
@@ -138,8 +138,8 @@ def test_partial_resets_equal_torchrls():
     assert ours[0]["next", "done"].sum(1).flatten().tolist() == [4, 2, 2]  # of 2, 3, 4 steps
 
 
-def both_ways(make_policy, change=lambda _: None):
-    """Batches of VectorCollector and of Collector, from a policy each."""
+def batches_of_both_collectors(make_policy, change=lambda _: None):
+    """Batches of VectorCollector and of Collector, each with its own copy of the policy."""
     found = []
     for kind, options in ((VectorCollector, {}), (Collector, PLAIN)):
         torch.manual_seed(0)
@@ -149,18 +149,18 @@ def both_ways(make_policy, change=lambda _: None):
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_policy_that_cannot_be_traced_acts_as_under_torchrl(name):
-    assert_same(*both_ways(MAKERS[name]))
+    assert_same(*batches_of_both_collectors(MAKERS[name]))
 
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_change_of_the_policy_between_batches_takes_effect(name):
-    ours, theirs = both_ways(*CHANGES[name])
+    ours, theirs = batches_of_both_collectors(*CHANGES[name])
     assert_same(ours, theirs)
     assert not torch.equal(ours[0]["action"], ours[1]["action"])
 
 
 def test_without_a_policy_actions_are_random_as_under_torchrl():
-    ours, theirs = both_ways(lambda: None)
+    ours, theirs = batches_of_both_collectors(lambda: None)
     assert_same(ours, theirs)
     assert ours[0]["action"].std() > 0.3
 
@@ -279,7 +279,7 @@ def test_two_transforms_of_one_class_both_apply():
 
 
 class Pays(Transform):
-    """Writes an effort, and pays ten times the reward from there on."""
+    """Writes an effort and multiplies the reward by ten for the transforms after it."""
 
     def __init__(self) -> None:
         super().__init__(in_keys=[], out_keys=["effort"])
@@ -297,7 +297,7 @@ class Pays(Transform):
         after["reward"] = 10 * after["reward"]
 
     def array_reset(self, now, fresh, done):
-        """An effort is none of the root's."""
+        """A reset writes no effort."""
 
 
 def test_reward_sum_respects_its_keys_and_the_order_of_transforms():

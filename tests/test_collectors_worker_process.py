@@ -1,4 +1,4 @@
-"""What a signal to all processes of a run leaves alone."""
+"""Signals to all processes of a run and multiprocessing's resource tracker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What README.md and docs/ show runs, and what they link to exists."""
+"""Code and commands of README.md and docs/ run, and their links resolve."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ COMMAND = re.compile(r"^ *python recipes/(\w+\.py)(.*)$", re.MULTILINE)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 TESTED_ELSEWHERE = {
-    # Builds all thirteen tasks and is compared with the page.
+    # Its code builds all thirteen tasks; the output is compared with the page.
     "docs/tasks.md": "tests/test_envs.py",
-    # Files of which one imports the other.
+    # Its blocks are files that import each other.
     "docs/extend.md": "tests/test_extend.py",
-    # Half of it runs in the environment of the peers.
+    # Half of its code runs in the environment of the peers.
     "docs/without_torchrl.md": "tests/test_without_torchrl.py",
 }
 
@@ -58,7 +58,7 @@ def test_python_blocks_run_in_order(page, tmp_path, monkeypatch):
     text = page.read_text(encoding="utf-8")
     namespace = {"__name__": "__main__"}
     for block in BLOCK.finditer(text):
-        # Blank lines in front give errors the page's own line numbers.
+        # Blank lines in front make line numbers of errors those of the page.
         padding = "\n" * (text[: block.start(1)].count("\n"))
         exec(compile(padding + block[1], str(page), "exec"), namespace)
 
@@ -70,7 +70,7 @@ def commands(page: Path) -> list[tuple[str, list[str]]]:
 
 
 @pytest.mark.parametrize(
-    # extend.md has files of its own, on which its commands build.
+    # The commands of extend.md need the files of that page.
     "page",
     [page for page in PAGES if commands(page) and name_of(page) != "docs/extend.md"],
     ids=name_of,
@@ -83,17 +83,17 @@ def test_commands_are_accepted_by_their_recipe(page, tmp_path, monkeypatch, caps
             assert arguments in ([], ["names"]), told
             continue
         if recipe == "report.py":
-            # 2: there are no results here. A setting that it does not have is 1.
+            # Exit code 2: there are no results here. An unknown setting would give 1.
             assert command(recipe, *arguments) == 2, told
             continue
-        # Hydra then prints what it would hand to the recipe; NAME and ... are parts of paths.
+        # With --cfg=job Hydra only prints the configuration; NAME and ... are parts of paths.
         left = command(recipe, *arguments, "--cfg=job")
         said = capsys.readouterr()
         assert left == 0, f"{told}: {said.err}"
         config = OmegaConf.create(said.out)
         if recipe == "etl_sac.py":
             if config.collector.kind == "auto":
-                config.collector.kind = "single"  # which is found out before it is validated
+                config.collector.kind = "single"  # a run chooses the kind before it validates
             validate(config)
         elif recipe == "sweep.py":
             recipe_module("sweep").queue(config)  # validates each run

@@ -1,4 +1,4 @@
-"""The factory: what reaches the tensordict, from real MyoSuite and DMControl simulators."""
+"""make_env on real MyoSuite and DMControl simulators: specs, seeds, goals, ends of episodes."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ NAMES = [task.name for task in list_tasks()]
 
 
 def replay(env, seed, actions):
-    """Resets with a seed, and returns what each step of the given actions produced."""
+    """The reset with a seed and the steps of the given actions, as tensordicts."""
     env.set_seed(seed)
     td = env.reset()
     seen = [td]
@@ -126,7 +126,7 @@ def test_random_goal_changes_between_episodes_and_the_fixed_one_does_not():
 
 @pytest.mark.parametrize("excitation, length, dropped", [(-1.0, 50, False), (1.0, 13, True)])
 def test_pen_twirl_truncates_at_its_limit_and_terminates_on_a_drop(excitation, length, dropped):
-    # A relaxed hand keeps the pen lying there; one that clenches throws it out.
+    # A relaxed hand keeps the pen; a clenched one throws it out.
     rollout = make_env("myoHandPenTwirl", seed=0).rollout(
         60, lambda td: td.set("action", torch.full((39,), excitation))
     )
@@ -138,7 +138,7 @@ def test_pen_twirl_truncates_at_its_limit_and_terminates_on_a_drop(excitation, l
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_action_repeat_sums_rewards_within_the_episode(num_envs):
-    """Each step pays 1, is solved from the second on, and the limit is four of the simulator's."""
+    """Steps of the simulator: reward 1 each, solved from the second on, at most four."""
     env = make_env(PLANTED, num_envs=num_envs, action_repeat=3, seed=0)
     check_env_specs(env, seed=0)
     rollout = env.rollout(9)["next"].reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Actions of every kind: synergies can be found in them, or one sentence says why not."""
+"""Action spaces: boxes of any shape become flat actuators; others are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_etl.envs import actuator_names, make_env
 
 
 class Takes(gym.Env):
-    """Shows the last action, flat, and checks that each one has the space's own shape."""
+    """Observes the last action, flattened, and checks that actions have the shape of the space."""
 
     def __init__(self, space):
         self.action_space = space

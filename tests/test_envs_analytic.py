@@ -1,4 +1,4 @@
-"""The analytic system: only the known subspace moves it."""
+"""The analytic system, which only actions in a known subspace move."""
 
 import numpy as np
 import pytest

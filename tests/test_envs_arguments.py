@@ -1,4 +1,4 @@
-"""``env_kwargs``: arguments that a simulator ignores are refused, those that it reads are not."""
+"""``env_kwargs``: arguments that a simulator reads are passed on, ignored ones are refused."""
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +8,7 @@ from torchrl_etl.envs import make_env
 
 
 class Forgiving(gym.Env):
-    """Takes any argument, reads one by its name in the signature and one out of the rest."""
+    """Takes any argument, but reads only ``stiffness`` and, from ``kwargs``, ``recipe``."""
 
     observation_space = gym.spaces.Box(-1, 1, (1,))
     action_space = gym.spaces.Box(-1, 1, (1,))

@@ -1,4 +1,4 @@
-"""Numbers that are not finite stop a run, and the error says where they came from."""
+"""Non-finite numbers stop a run with an error that says where they came from."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""joint_torques on bodies whose moment arms are known, and on MyoSuite's."""
+"""joint_torques on a body with known moment arms, and on MyoSuite's bodies."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torchrl_etl.envs import excitation, joint_torques, make_env, mujoco_state
 from torchrl_etl.envs.muscles import sends_sigmoid
 from torchrl_etl.envs.wrappers import NamedObservation
 
-# A hinge with a flexor and an extensor that pull at 0.02 and 0.03 m, and a slide tied to it that a
-# third muscle pulls with an arm of 1. Tendons are straight, so arms are the same in all postures.
+# A hinge with a flexor and an extensor of moment arms 0.02 and 0.03 m, and a slide, coupled to the
+# hinge, with a third muscle of arm 1. Tendons are fixed, so arms are the same in all postures.
 BODY = """
 <mujoco>
   <worldbody>
@@ -62,9 +62,9 @@ def body():
 
 def test_torques_are_moment_arms_times_forces_summed_over_coupled_joints(body):
     torques = joint_torques(body, num_postures=1)
-    assert torques.joints == ("knee",)  # the slide is tied to it, and nothing turns the third
+    assert torques.joints == ("knee",)  # the slide is coupled to it, and no muscle turns the third
     flexor, extensor, slider = torques.matrix[0]
-    # All three have the same peak force F at the same length: F·0.02, -F·0.03, 0.1·F·1.
+    # With the same peak force F of all three muscles: F·0.02, -F·0.03 and 0.1·F·1.
     assert flexor > 0
     assert extensor / flexor == pytest.approx(-1.5, rel=1e-6)
     assert slider / flexor == pytest.approx(5.0, rel=1e-6)
@@ -106,7 +106,7 @@ def test_legs_turn_seven_joints_each_and_the_sides_mirror():
     assert matrix.shape == (14, 80)
     right, left = joints[:7], joints[7:]
     assert [name.removesuffix("_r") for name in right] == [name.removesuffix("_l") for name in left]
-    # No muscle is of both sides.
+    # No muscle turns joints of both sides.
     assert not ((np.abs(matrix[:7]).max(0) > 1e-6) & (np.abs(matrix[7:]).max(0) > 1e-6)).any()
 
 

@@ -1,4 +1,4 @@
-"""Activations, lengths and names of muscles are the simulators' own."""
+"""Activations, lengths and names of muscles against the simulators'."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Hand Pose with MyoSuite 2's hand, against what MyoSuite 2 itself gives."""
+"""Hand Pose with the hand of MyoSuite 2, against numbers recorded in MyoSuite 2."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import torch
 from torchrl_etl.envs import make_env, mujoco_state
 
 
-def played(name, steps=50):
+def recorded_rollout(name, steps=50):
     """Rewards of uniform actions, contacts by step, and the last observation."""
     env = make_env(name)
     env.set_seed(0)
@@ -24,9 +24,9 @@ def played(name, steps=50):
 
 
 def test_myo2_hand_pose_matches_myosuite_2():
-    # Return, contacts and joint angles of the same steps in myosuite 2.5.0 and 2.12.2, on the
-    # mujoco of requirements.lock. The two agree to the digits that are compared.
-    rewards, contacts, observation = played("myo2HandPose")
+    # Return, contacts and joint angles of the same steps, recorded in myosuite 2.5.0 and 2.12.2
+    # with the mujoco of requirements.lock. The two agree to the compared digits.
+    rewards, contacts, observation = recorded_rollout("myo2HandPose")
     assert rewards.sum() == pytest.approx(-152.04584, rel=1e-6)
     assert contacts.sum() == 482
     recorded = [0.84379, 0.44273, 0.80945, -0.54541, 0.71967]
@@ -34,8 +34,8 @@ def test_myo2_hand_pose_matches_myosuite_2():
 
 
 def test_hand_pose_of_myosuite_3_differs():
-    # Once this fails, MyoSuite's own Hand Pose has contacts again and may be the old task.
-    rewards, contacts, _ = played("myoHandPose")
+    # If this fails, MyoSuite's Hand Pose has contacts again and may be the old task.
+    rewards, contacts, _ = recorded_rollout("myoHandPose")
     assert contacts.sum() == 0
     assert rewards.sum() == pytest.approx(-174.51, abs=0.1)
 

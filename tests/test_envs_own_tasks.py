@@ -1,4 +1,4 @@
-"""Tasks that a user registers: found by module, for every process, and refused in one sentence."""
+"""Tasks that a user registers: found by module in every process, or refused in one sentence."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ gym.register("%s", entry_point=Reach, max_episode_steps=20)
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch) -> str:
-    """A task whose module lies in the current folder, and nowhere on the path."""
+def own_task(tmp_path, monkeypatch) -> str:
+    """The id of a task whose module lies in the current folder and not on the path."""
     module, env_id = f"own_{tmp_path.name.replace('-', '_')}", "Reach-v0"
     (tmp_path / f"{module}.py").write_text(REACH % env_id)
     monkeypatch.chdir(tmp_path)
@@ -50,17 +50,17 @@ def own(tmp_path, monkeypatch) -> str:
     sys.modules.pop(module, None)
 
 
-def test_a_module_in_the_current_folder_registers_its_task(own):
-    task = resolve_task(own)
-    assert (task.name, task.env_id, task.episode_steps) == (own, "Reach-v0", 20)
+def test_a_module_in_the_current_folder_registers_its_task(own_task):
+    task = resolve_task(own_task)
+    assert (task.name, task.env_id, task.episode_steps) == (own_task, "Reach-v0", 20)
     assert task.goal is None and task.solved_steps is None
-    env = make_env(own, num_envs=2, seed=0)
+    env = make_env(own_task, num_envs=2, seed=0)
     assert env.rollout(3)["action"].shape == (2, 3, 4)
-    assert actuator_names(own) == [f"actuator_{i}" for i in range(4)]
+    assert actuator_names(own_task) == [f"actuator_{i}" for i in range(4)]
 
 
-def test_id_not_registered_by_the_module_is_refused(own):
-    module = own.partition(":")[0]
+def test_id_not_registered_by_the_module_is_refused(own_task):
+    module = own_task.partition(":")[0]
     with pytest.raises(ValueError, match=f"Importing '{module}' registers no task 'Raech-v0'"):
         resolve_task(f"{module}:Raech-v0")
 
@@ -79,19 +79,19 @@ def test_import_error_within_the_module_is_passed_on(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_recipe_trains_and_evaluates_a_users_task(own, tmp_path):
+def test_recipe_trains_and_evaluates_a_users_task(own_task, tmp_path):
     run = f"run_dir='{tmp_path}/run'"
-    assert command("etl_sac.py", *SMALL, f"env={own}", "success_key=arrived", run) == 0
+    assert command("etl_sac.py", *SMALL, f"env={own_task}", "success_key=arrived", run) == 0
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["env"] == own and summary["goal"] is None
+    assert summary["env"] == own_task and summary["goal"] is None
     assert 0 <= summary["learn"]["solved"]["after"] <= 1
     assert command("evaluate.py", f"run='{tmp_path}/run'", "episodes=1") == 0
 
 
 @pytest.mark.slow
-def test_workers_find_a_users_task_but_not_a_recipe_in_another_folder(own, tmp_path):
+def test_users_task_is_found_by_workers_but_not_from_another_folder(own_task, tmp_path):
     settings = ("collector=process", "success_key=arrived", f"run_dir='{tmp_path}/run'")
-    done = process("etl_sac.py", *SMALL, f"env={own}", *settings, cwd=tmp_path)
+    done = process("etl_sac.py", *SMALL, f"env={own_task}", *settings, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (elsewhere := tmp_path / "elsewhere").mkdir()
     done = process("evaluate.py", f"run='{tmp_path}/run'", "episodes=1", cwd=elsewhere)

@@ -1,4 +1,4 @@
-"""``solved``: what environments say of success, under any name and at any step of an episode."""
+"""``solved``: success from an environment's info, under any key and at any step."""
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +13,7 @@ from torchrl_etl.training.evaluation import evaluate
 
 
 class Ends(gym.Env):
-    """Ends at its fourth step, and tells of its success in that step's ``info`` only."""
+    """Ends at its fourth step, whose info alone has the key unless ``solved`` has several steps."""
 
     observation_space = gym.spaces.Box(-1, 1, (1,))
     action_space = gym.spaces.Box(-1, 1, (1,))
@@ -36,8 +36,8 @@ gym.register("torchrl_etl_test/Ends-v0", entry_point=Ends, max_episode_steps=9)
 ENDS = "torchrl_etl_test/Ends-v0"
 
 
-def share_solved(env, solved_steps, **options):
-    """Of evaluation episodes with actions of zero."""
+def evaluate_zero_actions(env, solved_steps, **options):
+    """Evaluates a policy whose actions are zero."""
     still = TensorDictModule(torch.zeros_like, in_keys=["observation"], out_keys=["action"])
     return evaluate(still, env, episodes=2, max_steps=9, solved_steps=solved_steps, **options)
 
@@ -55,22 +55,22 @@ def test_env_without_success_has_no_solved_entry():
 def test_success_in_the_last_info_only_counts_as_solved():
     env = make_env(ENDS)
     assert env.rollout(9)["next", "solved"].flatten().tolist() == [False, False, False, True]
-    measured = share_solved(env, resolve_task(ENDS).solved_steps)
+    measured = evaluate_zero_actions(env, resolve_task(ENDS).solved_steps)
     assert measured.successes == [True, True] and measured.solved.mean == 1
     assert measured.solved_steps == [1, 1] and measured.lengths == [4, 4]
 
 
 def test_without_a_threshold_lost_success_does_not_count():
     env = make_env(ENDS, env_kwargs={"solved": (1, 2, 3)})
-    assert share_solved(env, None).successes == [False, False]
-    assert share_solved(env, 3).successes == [True, True]
-    assert share_solved(env, 4).successes == [False, False]
+    assert evaluate_zero_actions(env, None).successes == [False, False]
+    assert evaluate_zero_actions(env, 3).successes == [True, True]
+    assert evaluate_zero_actions(env, 4).successes == [False, False]
 
 
 def test_threshold_counts_simulator_steps_under_action_repeat():
     env = make_env(ENDS, action_repeat=2, env_kwargs={"solved": (1, 2, 3, 4)})
-    assert share_solved(env, 4, action_repeat=2).successes == [True, True]
-    assert share_solved(env, 5, action_repeat=2).successes == [False, False]
+    assert evaluate_zero_actions(env, 4, action_repeat=2).successes == [True, True]
+    assert evaluate_zero_actions(env, 5, action_repeat=2).successes == [False, False]
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
@@ -87,7 +87,7 @@ def test_success_key_missing_from_info_warns_after_the_first_episode():
     env.rollout(3)
     with pytest.raises(RuntimeWarning, match=r"success_key is 'arived', .*it has arrived"):
         env.rollout(4)
-    env.rollout(4)  # once
+    env.rollout(4)  # it warns only once
 
 
 @pytest.mark.parametrize(

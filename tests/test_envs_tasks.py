@@ -1,4 +1,4 @@
-"""Names: what resolves to what, and what a wrong one is told."""
+"""Names of tasks: what they resolve to, and what is suggested for an unknown one."""
 
 import subprocess
 import sys
@@ -118,7 +118,7 @@ def test_dropping_the_object_does_not_end_full_episodes(name, random_actions_dro
     early = make_env(name, seed=0).rollout(1000)
     steps = len(early)
     assert (steps < len(full)) == random_actions_drop
-    # Until then both are the same; only the early end is gone.
+    # Up to the early end both are the same.
     torch.testing.assert_close(full["next", "observation"][:steps], early["next", "observation"])
     torch.testing.assert_close(full["next", "reward"][:steps], early["next", "reward"])
 
