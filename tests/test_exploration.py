@@ -1,4 +1,4 @@
-"""Held noise: distributed as the actor says at every step, kept for as long as it should be."""
+"""HeldNoise: the distribution of the actor at every step, held for a zeta-distributed time."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_held_noise_has_the_actors_distribution():
     before_tanh = torch.atanh(2 * action - 1)
     standard = (before_tanh - distribution.loc) / distribution.scale
     assert kstest(standard.detach()[:, 0], "norm").pvalue > 0.01
-    correlation = standard.mT.corrcoef()[0, 1]  # of the two actuators
+    correlation = standard.mT.corrcoef()[0, 1]  # between the two actuators
     assert correlation.abs() < 3 / ROWS**0.5
 
 
@@ -59,7 +59,7 @@ def test_durations_follow_the_truncated_zeta_distribution():
 
 
 def test_an_episode_begins_with_fresh_noise_and_rows_are_independent():
-    held = policy(longest=1_000_000, exponent=0.01)  # practically for ever
+    held = policy(longest=1_000_000, exponent=0.01)  # practically never redrawn within an episode
     first = step(held, True, rows=4)
     begins = torch.tensor([[True], [False], [False], [True]])
     second = step(held, begins, rows=4)

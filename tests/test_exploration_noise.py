@@ -1,4 +1,4 @@
-"""Stage 1 of noise: nothing but the synergy model learns, and a killed run goes on."""
+"""Stage 1 with exploration=noise: only the synergy model learns, and a killed run resumes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOISE = "exploration=noise"
 
 
 def test_actions_are_the_tanh_of_the_noise_in_the_bounds():
-    """2 x with x held: tanh(2 x) of bounds [0, 4] is 2 + 2 tanh(2 x)."""
+    """For noise x, a std of 2 and bounds [0, 4] the action is 2 + 2 tanh(2 x)."""
     low, high = torch.zeros(3), torch.full((3,), 4.0)
     policy = LastingNoise(low, high, HeldNormal(4), std=2.0)
     begins = torch.ones(5, 1, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Stage 1 with RND: what is learned by whom, that the bonus fades, that a killed run goes on."""
+"""Stage 1 with RND: which loss trains which network, the fading bonus, and resume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stage 1 takes from any exploration."""
+"""What stage 1 takes from any Exploration: noise, relabeling and transforms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_etl.modules import HeldNoise
 
 
 class Counted(Exploration):
-    """One of a user's own, whose transform does not say what it does on arrays."""
+    """A user's Exploration whose transform has no array methods for VectorCollector."""
 
     keep = ("step_count",)
 
@@ -31,7 +31,7 @@ def test_configured_actor_noise_is_the_behavior_policy_of_stage_1():
 
 
 def test_synergies_are_fitted_to_actions_for_relabeled_directions():
-    """Of the policy as it is now, for other directions than those that were followed."""
+    """Actions of the current policy, for redrawn directions instead of those that were followed."""
     found = explorer()
     found.stage.collect()
     rows = found.stage.newest(32)

@@ -1,4 +1,4 @@
-"""docs/extend.md: its files run as they stand, and a kind of one's own that cannot run says why."""
+"""docs/extend.md: its files run as printed, and a user's class that cannot run is refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OWN = ("exploration=curiosity", "synergies=random")
 
 
 class Rebuilt(LossModule):
-    """Squared error of actions [B, n] that are rebuilt from d coefficients."""
+    """Squared error of actions [B, n] reconstructed from d coefficients."""
 
     def __init__(self, n, d):
         super().__init__()
@@ -51,7 +51,7 @@ class Rebuilt(LossModule):
 
 
 class Learned(SynergyModel):
-    """A model with a loss, which has what the page's table asks for and no more."""
+    """A synergy model with a loss and only the methods that the page's table requires."""
 
     kind = "learned"
 
@@ -74,7 +74,7 @@ class Learned(SynergyModel):
 
 
 class Embedding(Exploration):
-    """Where a transition ends, beside where it begins."""
+    """Embeds a transition as its next and its current observation."""
 
     def embed(self, rows):
         return rows["next", "observation"], rows["observation"]
@@ -95,15 +95,15 @@ class Remembering(Logger):
 
 
 class NoBundle(Learned):
-    """Its decoder is another class."""
+    """A synergy model whose decoder is no SynergyDecoder."""
 
     def decoder(self, actions, *, residual=0.0):
         return SARDecoder(actions.mean(0), self.loss.basis.detach(), **self.bounds)
 
 
 @pytest.fixture
-def own(tmp_path, monkeypatch):
-    """The page's files in a folder of their own, which is the current one."""
+def page_files(tmp_path, monkeypatch):
+    """The files of the page in a new current folder."""
     folder = tmp_path / "my folder"
     for name, content in FILES.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -127,21 +127,21 @@ def test_the_page_has_one_short_python_file_and_one_yaml_file_for_each():
         assert sum(bool(line.strip()) for line in code.splitlines()) < 40, name
 
 
-def test_both_stages_run_with_the_classes_of_the_page(own, tmp_path):
+def test_both_stages_run_with_the_classes_of_the_page(page_files, tmp_path):
     settings = ("learn.prefill=true", "learn.decoder.residual=0.5", *BRIEF)
     summary = Experiment(tiny(f"run_dir='{tmp_path}/run'", *OWN, *settings)).run()
     assert summary["learn"]["frames"] == 64
     assert load_bundle(tmp_path / "run")[1].kind == "random"
 
 
-def of_this_file(kind, tmp_path):
-    """A run with a synergy model of this file: pca's section has no options of its own."""
+def config_with_model(kind, tmp_path):
+    """A run with a synergy model of this file, in place of pca, whose section has no options."""
     own = ("synergies=pca", f"synergies.kind=tests.test_extend:{kind}", *BRIEF)
     return tiny(f"run_dir='{tmp_path}/run'", *own, "pictures=true", "vaf_curve.dims=[1]")
 
 
 def test_synergy_model_with_a_loss_runs_both_stages_and_draws_pictures(tmp_path):
-    summary = Experiment(of_this_file("Learned", tmp_path)).run()
+    summary = Experiment(config_with_model("Learned", tmp_path)).run()
     assert summary["learn"]["frames"] == 64
     assert load_bundle(tmp_path / "run")[1].kind == "learned"
     drawn = {file.name for file in (tmp_path / "run" / "pictures").iterdir()}
@@ -180,18 +180,18 @@ def test_users_logger_gets_the_scalars_and_another_class_is_refused(tmp_path):
 def test_model_with_an_unsupported_decoder_is_refused_before_stage_1(tmp_path):
     words = "NoBundle, whose decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
     with pytest.raises(ValueError, match=words):
-        Experiment(of_this_file("NoBundle", tmp_path))
+        Experiment(config_with_model("NoBundle", tmp_path))
     assert not (tmp_path / "run").exists()
 
 
-def test_stage_1_with_the_classes_of_the_page_resumes_with_equal_numbers(own, tmp_path):
+def test_stage_1_with_the_classes_of_the_page_resumes_with_equal_numbers(page_files, tmp_path):
     def make():
         return Explorer(Experiment(tiny("run_dir=unused", *OWN)).context).stage
 
     assert goes_on_after_a_load(make, tmp_path)
 
 
-def test_curiosity_rewards_the_prediction_error_and_trains_its_model(own):
+def test_curiosity_rewards_the_prediction_error_and_trains_its_model(page_files):
     found = Explorer(Experiment(tiny("run_dir=unused", *OWN)).context)
     found.stage.restart_collection()
     for _ in range(6):
@@ -206,7 +206,7 @@ def test_curiosity_rewards_the_prediction_error_and_trains_its_model(own):
     found.stage.close()
 
 
-def test_random_synergies_fit_recordings_worse_than_nmf(own, capsys):
+def test_random_synergies_fit_recordings_worse_than_nmf(page_files, capsys):
     code = compile(FILES["recordings.py"], "recordings.py", "exec")
     sys.path.append("")
     exec(code, {"__name__": "__main__"})
@@ -214,7 +214,7 @@ def test_random_synergies_fit_recordings_worse_than_nmf(own, capsys):
     assert nmf > 0.99 > at_random > 0
 
 
-def test_thrift_method_runs_and_resumes_with_equal_numbers(own, tmp_path):
+def test_thrift_method_runs_and_resumes_with_equal_numbers(page_files, tmp_path):
     def make():
         return Experiment(tiny("run_dir=unused", "method=thrift")).method.stage()
 
@@ -225,7 +225,7 @@ def test_thrift_method_runs_and_resumes_with_equal_numbers(own, tmp_path):
     assert resumed_config(tmp_path / "run").method.kind == "thrift:Thrift"
 
 
-def test_thrift_method_learns_on_reward_minus_effort(own):
+def test_thrift_method_learns_on_reward_minus_effort(page_files):
     asked = ("method=thrift", "method.options.price=2")
     stage = Experiment(tiny("run_dir=unused", *asked)).method.stage()
     stage.restart_collection()
@@ -249,14 +249,14 @@ def test_thrift_method_learns_on_reward_minus_effort(own):
         ("kind", None, r"method\.kind is None; choose one of etl, sac, lattice"),
     ],
 )
-def test_unusable_method_settings_are_refused(key, value, words, own):
+def test_unusable_method_settings_are_refused(key, value, words, page_files):
     config = tiny("run_dir=unused", "method=thrift")
     OmegaConf.update(config, f"method.{key}", value, force_add=True)
     with pytest.raises(ValueError, match=words):
         Experiment(config)
 
 
-def test_command_line_accepts_kinds_with_a_config_file(own):
+def test_command_line_accepts_kinds_with_a_config_file(page_files):
     settings = ("exploration.lr=0.1", "synergies.seed=3", "method=thrift", "method.options.price=1")
     check_overrides(CONF / "config.yaml", [*OWN, *settings], "")
     assert translate(["synergies=random"], CONF) == ["synergies=random"]
@@ -265,7 +265,7 @@ def test_command_line_accepts_kinds_with_a_config_file(own):
     assert translate(kinds, CONF) == ["method.kind=a:B", "method=sar"]
 
 
-def test_recipe_finds_a_users_config_files(own, capsys):
+def test_recipe_finds_a_users_config_files(page_files, capsys):
     assert command("etl_sac.py", *OWN, "method=thrift", "synergies.seed=3", "--cfg=job") == 0
     config = OmegaConf.create(capsys.readouterr().out)
     kinds = [config[group].kind for group in ("exploration", "synergies", "method")]
@@ -274,7 +274,7 @@ def test_recipe_finds_a_users_config_files(own, capsys):
     assert "exploration:   # exploration=curiosity\n  kind: curiosity" in capsys.readouterr().out
 
 
-def test_exported_command_names_a_users_config_files(own):
+def test_exported_command_names_a_users_config_files(page_files):
     made = tiny("run_dir=unused", *OWN, "exploration.lr=0.1")
     told = shlex.split(command_of(made, composed, CONF, "toy"))[2:]
     assert {*OWN, "exploration.lr=0.1"} < {*told}
@@ -290,19 +290,19 @@ def test_exported_command_names_a_users_config_files(own):
         ("curiosity", ValueError, r"exploration\.kind is 'curiosity'; choose one of metric, metra"),
     ],
 )
-def test_unknown_exploration_kind_is_refused(kind, error, words, own):
+def test_unknown_exploration_kind_is_refused(kind, error, words, page_files):
     config = tiny("run_dir=unused", *OWN)
     config.exploration.kind = kind
     with pytest.raises(error, match=words):
         Explorer(Experiment(config).context)
 
 
-def test_users_kind_without_a_config_file_is_refused(own):
+def test_users_kind_without_a_config_file_is_refused(page_files):
     config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity")
     with pytest.raises(ValueError, match=r"a file of its own in \./conf/exploration\.$"):
         Explorer(Experiment(config).context)
 
 
-def test_fit_synergies_takes_a_users_class_by_name(own):
+def test_fit_synergies_takes_a_users_class_by_name(page_files):
     model = fit_synergies(torch.rand(50, 6), "at_random:RandomSynergies", 2, seed=3)
     assert (model.kind, model.seed) == ("random", 3)

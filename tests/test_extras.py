@@ -1,4 +1,4 @@
-"""The core needs six packages; what an extra brings is imported where it is used."""
+"""The core needs six packages; packages of extras are imported where they are used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 
 USE = """
 import importlib, sys
-sys.modules |= dict.fromkeys({blocked!r})  # Python then finds no such package
+sys.modules |= dict.fromkeys({blocked!r})  # their import then fails
 for name in {packages!r}:
     package = importlib.import_module(f"torchrl_etl.{{name}}")
     [getattr(package, part) for part in package.__all__ if part != "resumed_config"]
@@ -64,7 +64,7 @@ for extra, use in lacking.items():
 
 
 def _names(requirements) -> set[str]:
-    """The distributions that requirements name, as they are written in metadata."""
+    """Normalized names of the distributions in a list of requirements."""
     found = (re.match(r"[\w.-]+", requirement)[0] for requirement in requirements)
     return {re.sub(r"[-_.]+", "-", name).lower() for name in found}
 
@@ -77,7 +77,7 @@ def _with_what_they_need(names: set[str]) -> set[str]:
         for name in new:
             try:
                 needed |= _names(r for r in requires(name) or () if "extra ==" not in r)
-            except PackageNotFoundError:  # on other systems
+            except PackageNotFoundError:  # a requirement of other systems
                 continue
         new = needed - every
     return every

@@ -1,4 +1,4 @@
-"""docs/faithfulness.md is complete, true to the configuration, and points at tests that exist."""
+"""docs/faithfulness.md is complete, agrees with the configuration and names existing tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study's legs with feedback: what it adds to an action, and that gains of 0 add nothing."""
+"""The study's legs with feedback: what feedback adds to an action, and nothing at zero gains."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,4 +1,4 @@
-"""Equations 1-6 against numbers worked by hand, closed forms and properties."""
+"""Equations 1-6 against numbers worked out by hand, closed forms and properties."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_hinge_pushes_apart_what_literal_pulls_together() -> None:
     for form, sign in (("hinge", 1.0), ("literal", -1.0)):
         x = torch.tensor([0.3], requires_grad=True)
         F.discriminability(*same, x, torch.zeros(1), 0.1, 1.0, form).backward()
-        assert -x.grad.item() * sign > 0, form  # the way a descent step goes
+        assert -x.grad.item() * sign > 0, form  # the direction of a descent step
 
 
 def test_hinge_is_zero_beyond_its_margin() -> None:

@@ -1,4 +1,4 @@
-"""Equations 7-10 against numbers worked by hand, closed forms and properties."""
+"""Equations 7-10 against numbers worked out by hand, closed forms and properties."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_bound_with_one_component_is_the_elbo_of_a_vae() -> None:
     x["prior_loc"], x["prior_scale"] = x["prior_loc"] * 0, x["prior_scale"] * 0 + 1
     terms = F.gmvae_bound(**x)
     loc, scale = x["loc"][:, 0], x["scale"][:, 0]
-    # The ELBO as every VAE tutorial writes it.
+    # The usual ELBO of a VAE.
     variance = x["likelihood_scale"].square()
     error = (x["action"] - x["decoded"][:, 0]).square()
     log_likelihood = -0.5 * (error / variance + (2 * math.pi * variance).log()).sum(-1)

@@ -1,4 +1,4 @@
-"""What studies/house.py counts in a small package with known chains and checks."""
+"""studies/house.py on a small package with known call chains and checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Seeds in processes of their own are the runs that each would have been by itself."""
+"""Seeds in separate processes give the same runs as each seed alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A file that cannot be read is one sentence of the reader's own error."""
+"""A file that cannot be read raises the caller's error with one sentence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchrl_etl.io import read_bytes, read_json
 
 
 class OurError(ValueError):
-    """Of the kind that a reader of JSON must not take for a fault of its own."""
+    """A ValueError, as JSON decoding raises, which read_json must let through."""
 
 
 def test_json_file_is_read(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Noise that lasts is standard normal at every step, correlated as its equation says."""
+"""Lasting noise: standard normal at every step, with the autocorrelation of its equation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_steps_are_standard_normal_from_the_first_on(noise):
 
 def test_pink_autocorrelation_is_a_mean_of_exponentials():
     """With a_i = exp(-1), exp(-1/2), exp(-1/4): over one step (0.368 + 0.607 + 0.779) / 3."""
-    rows = drawn(PinkNormal(longest=7), 12)  # 4 is the largest power of 2 in it
+    rows = drawn(PinkNormal(longest=7), 12)  # 4 is the largest power of 2 up to 7
     for steps, expected in ((1, 0.5844), (2, 0.3699), (8, 0.0513)):
         found = (rows[0] * rows[steps]).mean().item()
         assert found == pytest.approx(expected, abs=3 / math.sqrt(ROWS))

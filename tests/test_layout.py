@@ -1,4 +1,4 @@
-"""collector=auto: what it tries out, and what it leaves in the configuration."""
+"""collector=auto: the layouts that it tries, and the settings that it chooses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def auto(*overrides):
 
 @pytest.fixture
 def speeds(monkeypatch):
-    """Frames a second by layout, which the test fills in, on two cores."""
+    """Frames per second by layout on two cores; the test fills the table in."""
     table = defaultdict(float)
     monkeypatch.setattr(layout, "available_cores", lambda: 2)
     monkeypatch.setattr(layout, "frames_per_second", lambda stage, each, seconds: table[each])
@@ -82,7 +82,9 @@ def test_choose_layout_refuses_several_seeds():
 
 def test_run_after_choose_layout_equals_the_run_with_those_settings(monkeypatch, tmp_path):
     monkeypatch.setattr(layout, "available_cores", lambda: 2)
-    monkeypatch.setattr(layout, "CLEARLY_FASTER", 1e9)  # both are tried, the first is taken
+    monkeypatch.setattr(
+        layout, "CLEARLY_FASTER", 1e9
+    )  # all layouts are tried and the first is taken
     chosen = choose_layout(auto("threads=1", f"run_dir={tmp_path}/auto"), seconds=0.01)
     single = tiny("method=sac", f"run_dir={tmp_path}/single")
     tried, asked = (Experiment(config).run()["learn"] for config in (chosen, single))

@@ -1,4 +1,4 @@
-"""A learner's optimizer and EMA do what PyTorch's do; updates come one after another."""
+"""A learner's optimizer and EMA against PyTorch's, and its updates on several batches."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_step_along_equals_adam(unused):
     reference = Adam(groups(theirs), fused=True)
     for step in range(6):
         gradients = [None if i == unused(step) else torch.randn(3) for i in range(3)]
-        if step == 3:  # a learning rate falls, and a checkpoint is loaded
+        if step == 3:  # the learning rate changes and a checkpoint is loaded
             optimizer.param_groups[0]["lr"] = reference.param_groups[0]["lr"] = 0.02
             optimizer.load_state_dict(deepcopy(optimizer.state_dict()))
         optimizer.step_along(gradients)
@@ -58,7 +58,7 @@ def test_strides_of_gradients_and_loaded_moments_do_not_matter():
     plain = torch.nn.Parameter(turned.detach().contiguous())
     optimizers = [GradientAdam([weight], lr=0.1, fused=True) for weight in (turned, plain)]
     for step, gradient in enumerate(torch.randn(6, 2, 3)):
-        if step == 3:  # a checkpoint, which keeps no strides
+        if step == 3:  # load a checkpoint, which does not keep strides
             saved = [deepcopy(optimizer.state_dict()) for optimizer in optimizers]
             for moment in ("exp_avg", "exp_avg_sq"):
                 saved[0]["state"][0][moment] = saved[0]["state"][0][moment].contiguous()
@@ -128,7 +128,7 @@ def test_updates_on_several_batches_equal_updates_in_turn():
 
 
 class Measures(Transform):
-    """Pays by an encoder whose loss has targets."""
+    """A reward computed with an encoder whose loss has a target network."""
 
     def __init__(self, loss):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Products by oneDNN: the numbers of PyTorch's, forwards and backwards, however matrices lie."""
+"""Matrix products by oneDNN equal PyTorch's, forward and backward, for any strides."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def test_compiled_gradients_of_large_and_small_products_equal_eager_ones(capabil
 
     def gradients(features: Tensor) -> list[Tensor]:
         first, second, last = weights
-        # Some columns of a weight, as where the rest of them meets what a batch shares, and one of
-        # them as the bias.
+        # Some columns of a weight, as when the others multiply an input shared by the batch, and
+        # one column as the bias.
         hidden = torch.nn.functional.linear(features, first[:, 3:36], first[:, 0]).tanh()
         hidden = hidden + last[0]
         value = torch.nn.functional.linear(hidden @ second, last)

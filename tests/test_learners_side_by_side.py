@@ -1,4 +1,4 @@
-"""Learners updated side by side end where each would have ended by itself."""
+"""Learners updated side by side against learners updated alone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MAKERS = {
 
 
 def inputs(learners, batches):
-    """What one update of each learner reads, drawn by a generator that was seeded with its seed."""
+    """The inputs of one update of each learner, drawn after seeding with the learner's seed."""
     drawn = []
     for seed, learner, batch in zip(SEEDS, learners, batches, strict=True):
         torch.manual_seed(seed)
@@ -50,8 +50,8 @@ def inputs(learners, batches):
     return drawn
 
 
-def taken(learners):
-    """The learners side by side, their weights in one."""
+def with_stacked_weights(learners):
+    """The learners side by side, with their weights stacked."""
     group = SideBySide(learners)
     group._take()
     return group
@@ -60,7 +60,7 @@ def taken(learners):
 def assert_gradients_are_those_of_each(learners, batches):
     read = inputs(learners, batches)
     alone = [learner.gradients(own[0]) for learner, own in zip(learners, read, strict=True)]
-    together, scalars, statistics = taken(learners).gradients(torch.cat(read))
+    together, scalars, statistics = with_stacked_weights(learners).gradients(torch.cat(read))
     for seed, (expected, logged, changed) in enumerate(alone):
         log = scalars[seed]
         for one, stack in zip(expected, together, strict=True):
@@ -107,7 +107,7 @@ def test_stacked_updates_equal_updates_of_each_learner():
         fill(one)
         other.learner.objective.load_state_dict(one.learner.objective.state_dict())
         other.learner.ema.load_state_dict(one.learner.ema.state_dict())
-    for stage in (*ours, *theirs):  # with a small eps Adam's first steps make a sign of rounding
+    for stage in (*ours, *theirs):  # with a small eps Adam's first steps would amplify rounding
         stage.learner.optimizer = GradientAdam(
             stage.learner.parameters, lr=1e-2, eps=1.0, fused=True
         )
@@ -138,12 +138,12 @@ def test_traced_gradients_of_stacked_learners_equal_eager_ones(name, traced_only
     batches = [stage.sample() for stage in stages]
     learners = [stage.updated for stage in stages]
     read = torch.cat(inputs(learners, batches))
-    with torch.no_grad():  # each its own, also of what is no network
+    with torch.no_grad():  # so that learners differ in more than networks
         if (sac := stages[1].updated.objective.sac) is not None:
             sac.log_alpha += 1
         if (normalizer := stages[1].updated.objective.normalizer) is not None:
             normalizer.mean += 1
-    group = taken(learners)
+    group = with_stacked_weights(learners)
     expected, _, changed = group.gradients(read)
     found, _, also = compiled(group.gradients)(read)
     for one, other in zip((*expected, *changed), (*found, *also), strict=True):
@@ -181,7 +181,7 @@ def test_first_call_of_inputs_consumes_no_extra_random_numbers():
 
 
 class Pays(Transform):
-    """Something of a network's, and random numbers; it counts its calls."""
+    """A reward from a network plus noise; counts its calls."""
 
     def __init__(self, network, noise=1.0):
         super().__init__()
@@ -195,7 +195,7 @@ class Pays(Transform):
 
 
 def paid_learners(make_transform):
-    """Two learners with a transform each, and what they read."""
+    """Two learners with a transform each, and their inputs."""
     learners, spec = [], Bounded(-1, 1, shape=(2,))
     for _ in SEEDS:
         actor = make_actor({"observation": 3}, spec)
@@ -209,14 +209,14 @@ def paid_learners(make_transform):
     return learners, [learner.inputs(batches) for learner in learners]
 
 
-def told_of(network, **options):
+def pays_by(network, **options):
     transform = Pays(network, **options)
     transform.networks = (network,)
     return transform
 
 
 def test_transforms_of_stacked_learners_share_no_state():
-    learners, inputs = paid_learners(lambda: told_of(torch.nn.Linear(3, 1)))
+    learners, inputs = paid_learners(lambda: pays_by(torch.nn.Linear(3, 1)))
     alone = [
         learner.loss(own[0])[1]["loss_qvalue"]
         for learner, own in zip(learners, inputs, strict=True)
@@ -238,14 +238,14 @@ def test_constant_reward_is_accepted():
     def make():
         network = torch.nn.Linear(3, 1)
         torch.nn.init.zeros_(network.weight)
-        return told_of(network, noise=0.0)
+        return pays_by(network, noise=0.0)
 
     learners, inputs = paid_learners(make)
     SideBySide(learners).updates(inputs)
 
 
 def test_synergy_models_with_different_update_counts_are_refused():
-    """As runs that were resumed may: the numbers are in the optimizer, which is saved."""
+    """Resumed runs may differ so: the optimizer's state has the number of updates."""
     fitters = []
     for seed, updates in zip(SEEDS, (1, 2), strict=True):
         found = explorer("exploration=noise", f"seed={seed}")

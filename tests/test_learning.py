@@ -1,4 +1,4 @@
-"""Both stages do on the analytic task what they are for."""
+"""Both stages learn the analytic task: stage 1 its subspace, stage 2 its goal."""
 
 from __future__ import annotations
 
