@@ -48,7 +48,7 @@ def test_one_seed_gets_no_interval():
     assert math.isnan(probability_of_improvement([([1.0, 2.0], [0.0])], repetitions=FEW).low)
 
 
-def test_probability_of_improvement():
+def test_probability_of_improvement_by_hand():
     low, high = [1.0, 2.0, 3.0], [4.0, 5.0]
     assert probability_of_improvement([(high, low)], repetitions=FEW) == (1.0, 1.0, 1.0)
     assert probability_of_improvement([(low, low)], repetitions=0).mean == 0.5

@@ -26,7 +26,7 @@ def make_decoder(residual: float = 0.0) -> SynergyDecoder:
     )
 
 
-def acting(value: float, decoder: SynergyDecoder) -> TensorDictSequential:
+def constant_policy(value: float, decoder: SynergyDecoder) -> TensorDictSequential:
     """A policy whose coefficients all have one value, followed by the decoder."""
 
     def emit(observation: torch.Tensor) -> torch.Tensor:
@@ -79,7 +79,7 @@ def test_slow_simulator_does_not_catch_up_on_missed_time():
 
 def test_sliders_continue_past_the_end_and_the_policy_starts_an_episode():
     decoder = make_decoder()
-    session = open_session(decoder=decoder, policy=acting(0.3, decoder))
+    session = open_session(decoder=decoder, policy=constant_policy(0.3, decoder))
     assert session.driver == "policy"
     for _ in range(25):
         session.step()
@@ -94,7 +94,7 @@ def test_sliders_continue_past_the_end_and_the_policy_starts_an_episode():
 
 def test_episode_equals_that_of_evaluate():
     decoder = make_decoder()
-    policy = acting(0.3, decoder)
+    policy = constant_policy(0.3, decoder)
     session = open_session(decoder=decoder, policy=policy)
     session.reset(1)
     while not session.over:
@@ -106,7 +106,7 @@ def test_episode_equals_that_of_evaluate():
 
 def test_sliders_show_the_policys_coefficients():
     decoder = make_decoder()
-    session = open_session(decoder=decoder, policy=acting(0.25, decoder))
+    session = open_session(decoder=decoder, policy=constant_policy(0.25, decoder))
     session.step()
     assert session.coefficients.tolist() == [0.25, 0.25]
 
@@ -123,7 +123,7 @@ def test_a_policy_without_synergies_needs_no_decoder():
 
 def test_policy_with_the_residual_off_acts_through_synergies_only():
     decoder = make_decoder(residual=0.5)
-    session = open_session(decoder=decoder, policy=acting(0.25, decoder))
+    session = open_session(decoder=decoder, policy=constant_policy(0.25, decoder))
     assert session.has_residual
     session.step()
     whole = session.action

@@ -113,7 +113,7 @@ def test_deviations_have_the_papers_standard_deviation() -> None:
     torch.testing.assert_close(v.std(0), torch.full_like(mu, math.exp(0.5)), atol=0.03, rtol=0)
 
 
-def test_log_prob_is_that_of_the_groups_alone() -> None:
+def test_log_prob_is_that_of_the_group_actions() -> None:
     first = [0, 1, 3]
     dist = grouped(low=LOW, high=HIGH)
     theirs = TanhNormal(

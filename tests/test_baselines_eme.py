@@ -257,7 +257,7 @@ def test_distances_on_a_cycle_converge_to_the_fixed_point() -> None:
 
 
 @pytest.mark.parametrize(("gamma", "times"), [(0.95, 20), (0.99, 100), (0.0, 1)])
-def test_policies_that_always_differ_by_c_are_c_over_one_minus_gamma_apart(
+def test_constant_divergence_c_gives_distance_c_over_one_minus_gamma(
     gamma: float, times: int
 ) -> None:
     """d = c + gamma d: no reward, two states that never change, KL of N(0, 1) and N(2, 1) is 2."""

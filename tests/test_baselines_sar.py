@@ -122,7 +122,7 @@ def test_raw_actions_are_in_the_units_of_the_bounds() -> None:
     torch.testing.assert_close(decode(decoder, synergy), expected)
 
 
-def test_synergies_alone_by_hand() -> None:
+def test_decoding_without_residual_by_hand() -> None:
     decoder = by_hand(blend=1.0)
     assert decoder.synergy_dim == 2 and not decoder.residual
     action = decode(decoder, torch.tensor([[1.0, -0.4], [0.0, 0.0]]))

@@ -54,18 +54,20 @@ def start(address):
         collector.shutdown()
 
 
-def inside(collector: RayWorkers, worker: int, what) -> object:
+def call_in_worker(collector: RayWorkers, worker: int, what) -> object:
     """The result of a function of the worker's collector, called in the worker."""
     return ray.get(collector.remote_collectors[worker].__ray_call__.remote(what), timeout=30)
 
 
 def pid(collector: RayWorkers, worker: int) -> int:
-    return inside(collector, worker, lambda _: os.getpid())
+    return call_in_worker(collector, worker, lambda _: os.getpid())
 
 
 def test_next_synchronous_batch_uses_the_pushed_weights(start):
     collector, policy = start(sync=True, collector_class=VectorCollector)
-    nodes = [inside(collector, i, lambda _: ray.get_runtime_context().node_id) for i in range(2)]
+    nodes = [
+        call_in_worker(collector, i, lambda _: ray.get_runtime_context().node_id) for i in range(2)
+    ]
     assert len(set(nodes)) == 2
 
     batches = iter(collector)
@@ -139,7 +141,7 @@ def test_unresponsive_worker_counts_as_lost(start):
 
 def test_an_exception_in_a_worker_is_raised_and_names_it(start):
     collector, _ = start()
-    inside(collector, 1, lambda worker: setattr(worker.env, "step_and_maybe_reset", None))
+    call_in_worker(collector, 1, lambda worker: setattr(worker.env, "step_and_maybe_reset", None))
     with pytest.raises(RuntimeError, match="worker 1 failed"):
         for _ in range(10):
             next(iter(collector))

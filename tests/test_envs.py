@@ -64,7 +64,7 @@ def test_env_specs_are_valid(name, num_envs):
     "name, low, actuators",
     [("myoHandPenTwirl", -1, 39), ("myoLegWalk", 0, 80), ("humanoid-stand", -1, 21)],
 )
-def test_bounds_are_the_simulators(name, low, actuators):
+def test_action_bounds_equal_the_simulators(name, low, actuators):
     space = make_env(name).action_spec.space
     assert torch.equal(space.low, torch.full((actuators,), float(low)))
     assert torch.equal(space.high, torch.ones(actuators))

@@ -34,7 +34,7 @@ TAKES = "torchrl_etl_test/Takes-v0"
 gym.register(TAKES, entry_point=Takes, max_episode_steps=5)
 
 
-def taking(space: spaces.Space, **options):
+def env_with_space(space: spaces.Space, **options):
     return make_env(TAKES, env_kwargs={"space": space}, **options)
 
 
@@ -45,7 +45,7 @@ def box(low, high, dtype=np.float32) -> spaces.Box:
 @pytest.mark.parametrize("num_envs", [1, 2])
 @pytest.mark.parametrize("shape", [(2, 5), (), (1,), (1, 1, 3)])
 def test_actions_of_any_shape_are_flat_actuators(shape, num_envs):
-    env = taking(spaces.Box(-1, 2, shape), num_envs=num_envs, seed=0)
+    env = env_with_space(spaces.Box(-1, 2, shape), num_envs=num_envs, seed=0)
     size = int(np.prod(shape))
     assert env.full_action_spec_unbatched["action"].shape == (size,)
     assert env.action_spec.space.low.unique().item() == -1
@@ -73,12 +73,12 @@ def test_actions_of_any_shape_are_flat_actuators(shape, num_envs):
 )
 def test_unusable_action_spaces_are_refused_in_one_sentence(space, words):
     with pytest.raises(ValueError, match=words) as caught:
-        taking(space)
+        env_with_space(space)
     assert TAKES in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_bounds_of_a_million_are_accepted():
-    assert taking(box([-1e6], [1e6])).action_spec.space.high.item() == 1e6
+    assert env_with_space(box([-1e6], [1e6])).action_spec.space.high.item() == 1e6
 
 
 def test_unbounded_dm_control_motors_are_refused():

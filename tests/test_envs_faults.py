@@ -10,18 +10,18 @@ from torchrl_etl.envs import SimulationError, make_env
 
 @pytest.mark.parametrize("num_envs", [1, 2])
 @pytest.mark.parametrize(
-    "fault, says",
+    "fault, words",
     [
         ("observation", "observation is not finite (entries 1 of 3) at step 3 of episode 1"),
         ("overflow", "observation is not finite (entries 2 of 3) at step 3"),
         ("reward", "reward is not finite at step 3 of episode 1 (since seed 9)"),
     ],
 )
-def test_non_finite_numbers_stop_the_run_and_say_where(fault, says, num_envs):
+def test_non_finite_numbers_stop_the_run_and_say_where(fault, words, num_envs):
     env = make_env(PLANTED, num_envs=num_envs, env_kwargs={"fault": fault})
     with pytest.raises(SimulationError) as caught:
         env.rollout(4, auto_reset=False, tensordict=env.reset(seed=9))
-    assert says in str(caught.value) and PLANTED in str(caught.value)
+    assert words in str(caught.value) and PLANTED in str(caught.value)
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])

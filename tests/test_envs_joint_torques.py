@@ -130,17 +130,17 @@ def test_excitation_equals_the_simulators_controls(task):
     assert torch.allclose(excitation(env, action["action"]), driven, atol=1e-6)
 
 
-@pytest.mark.parametrize(("low", "told", "sigmoid"), [(0.0, None, False), (-1.0, True, True)])
-def test_bounds_and_flag_of_a_custom_body_define_its_excitation(body, low, told, sigmoid):
-    body.action_space, body.normalize_act = gym.spaces.Box(low, 1.0, (3,)), told
+@pytest.mark.parametrize(("low", "flag", "sigmoid"), [(0.0, None, False), (-1.0, True, True)])
+def test_bounds_and_flag_of_a_custom_body_define_its_excitation(body, low, flag, sigmoid):
+    body.action_space, body.normalize_act = gym.spaces.Box(low, 1.0, (3,)), flag
     assert sends_sigmoid(body, body.action_space.low, body.action_space.high) is sigmoid
     parts = NamedObservation(body, activations=True, muscle_lengths=True).observation_space
     assert parts["activation"].shape == parts["muscle_length"].shape == (3,)
 
 
-@pytest.mark.parametrize("told", [None, False])
-def test_custom_body_with_undefined_excitation_is_refused(body, told):
-    body.action_space, body.normalize_act = gym.spaces.Box(-1.0, 1.0, (3,)), told
+@pytest.mark.parametrize("flag", [None, False])
+def test_custom_body_with_undefined_excitation_is_refused(body, flag):
+    body.action_space, body.normalize_act = gym.spaces.Box(-1.0, 1.0, (3,)), flag
     env = GymWrapper(body)
     for asked in (
         lambda: excitation(env, torch.zeros(3)),
