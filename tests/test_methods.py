@@ -97,6 +97,15 @@ PUBLISHED = {
         "learn.critic.hidden": [1024, 1024],
     },
     "eme_paper": {"method.options.weight": 1.0, "method.options.normalize": False},
+    "sar_paper": {
+        "method.options.num_synergies": 20,
+        "method.options.blend": {"legs": 1.0, "hands": 0.66},
+        "learn.learning_starts": 5_000,
+        "learn.buffer_size": 300_000,
+        "learn.sac.gamma": 0.98,
+        "learn.sac.tau": 0.02,
+        "learn.sac.normalize_observations": True,
+    },
 }
 
 

@@ -160,7 +160,7 @@ def test_unit_rows_normalizes_linear_layers_only(tmp_path):
     stage.close()
 
 
-def test_ema_averages_the_actor_and_collection_uses_the_actor():
+def test_ema_of_the_actor_is_evaluated_and_the_actor_collects():
     stage = learn_stage(None, "learn.sac.ema_decay=0.25")
     fill(stage)
     averaged = list(stage.learner.ema.module.parameters())
@@ -171,12 +171,13 @@ def test_ema_averages_the_actor_and_collection_uses_the_actor():
         expected = expected or actor
         expected = [torch.lerp(new, old, kept) for old, new in zip(expected, actor, strict=True)]
         torch.testing.assert_close(averaged, expected)
-    assert {id(weight) for weight in stage.learner.behavior.parameters()} >= set(
-        map(id, stage.learner.actor.parameters())
+    evaluated, collecting = (
+        set(map(id, policy.parameters()))
+        for policy in (stage.learner.policy, stage.learner.behavior)
     )
-    assert not {id(weight) for weight in stage.learner.behavior.parameters()} & set(
-        map(id, averaged)
-    )
+    ema, followed = set(map(id, averaged)), set(map(id, stage.learner.actor.parameters()))
+    assert evaluated >= ema and evaluated.isdisjoint(followed)
+    assert collecting >= followed and collecting.isdisjoint(ema)
     stage.close()
 
 
