@@ -45,6 +45,12 @@ def test_nmf_recovers_non_negative_parts_above_any_lower_bound():
     assert nmf_vaf(low_rank_actions() + low, 1, low) < 0.95
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_nmf_is_the_same_in_every_unit(unit):
+    actions = low_rank_actions(noise=0.05).clip(0.0)
+    assert nmf_vaf(unit * actions, 2, 0.0) == pytest.approx(nmf_vaf(actions, 2, 0.0), abs=1e-6)
+
+
 def test_nmf_refuses_actions_below_the_bound():
     with pytest.raises(ValueError, match="below the lower bound"):
         nmf_vaf(low_rank_actions() - 0.5, 2, low=0.0)

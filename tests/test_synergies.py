@@ -87,6 +87,17 @@ def test_nmf_recovers_planted_factors() -> None:
     assert variance_accounted_for(actions, model.reconstruct(actions)) > 0.999
 
 
+@pytest.mark.parametrize("kind", AFFINE)
+def test_the_unit_of_a_recording_does_not_change_its_synergies(kind: str) -> None:
+    actions = activity() + 0.05 * torch.rand(400, 6)
+    model = fitted(kind, actions)
+    for unit in (1e-6, 1e6):
+        other = fit_synergies(unit * actions, kind, 2, low=0.0, high=unit)
+        expected = unit * model.reconstruct(actions)
+        found = other.reconstruct(unit * actions)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-3 * unit)
+
+
 @pytest.mark.parametrize(("kind", "origin"), [("nmf", "low"), ("sar", "mean")])
 def test_decoder_has_the_models_slope_at_mid_range(kind: str, origin: str) -> None:
     """Models of actions: a = origin + c·basis."""

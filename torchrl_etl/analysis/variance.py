@@ -121,7 +121,7 @@ def nmf_vaf(
             f"An action lies {-shifted.min():.3g} below the lower bound; pass the bound of these "
             "actions' own spec as low."
         )
-    shifted = shifted.clip(min=0.0)
+    shifted = shifted.clip(min=0.0) / (shifted.max() or 1.0)
     model = make_nmf(num_synergies)
     with unfinished():
         weights = model.fit_transform(shifted)

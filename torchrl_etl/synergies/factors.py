@@ -30,7 +30,10 @@ def principal_components(rows: np.ndarray, count: int, **options: Any) -> PCA:
 
 
 def make_nmf(count: int, max_iter: int = 500) -> NMF:
-    """NMF with ``count`` components and a deterministic initialization."""
+    """NMF with ``count`` components and a deterministic initialization.
+
+    Scale the rows to a maximum of 1: scikit-learn converges poorly on much larger values.
+    """
     with extra("synergies"):
         from sklearn.decomposition import NMF
     return NMF(count, init="nndsvda", max_iter=max_iter, random_state=0)

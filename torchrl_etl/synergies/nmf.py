@@ -52,14 +52,15 @@ class NMFSynergies(AffineSynergies):
         above = self._above_low(actions)
         # The factorization fails on all zeros, as when no muscle is ever active.
         above[0] += 1e-9 * (not above.any())
+        self._unit = above.max()
         with unfinished():
-            self.model.fit(above)
-        return self.model.components_
+            self.model.fit(above / self._unit)
+        return self._unit * self.model.components_
 
     def coefficients(self, actions: Tensor) -> Tensor:
         rows = actions.detach().reshape(-1, len(self.low)).cpu().double().numpy()
         with unfinished():
-            found = torch.as_tensor(self.model.transform(self._above_low(rows)))
+            found = torch.as_tensor(self.model.transform(self._above_low(rows) / self._unit))
         return found.to(self.low).reshape(*actions.shape[:-1], self.num_synergies)
 
     def compose(self, coefficients: Tensor) -> Tensor:
