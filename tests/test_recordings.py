@@ -52,7 +52,9 @@ def test_numpy_files_of_every_layout_are_read(tmp_path):
     np.save(tmp_path / "fields.npy", np.asarray(records))
     np.savez(tmp_path / "matrix.npz", emg=activity, names=np.array(MUSCLES), trial=trials)
     np.savez(tmp_path / "columns.npz", trial=trials, **dict(zip(MUSCLES, activity.T, strict=True)))
-    for name in ("fields.npy", "matrix.npz", "columns.npz"):
+    np.savez(tmp_path / "bytes.npz", emg=activity, names=np.array(MUSCLES, "S"), trial=trials)
+    (tmp_path / "renamed.npy").write_bytes((tmp_path / "matrix.npz").read_bytes())
+    for name in ("fields.npy", "matrix.npz", "columns.npz", "bytes.npz", "renamed.npy"):
         found = read_recording(tmp_path / name)
         assert found.muscles == MUSCLES, name
         np.testing.assert_array_equal(found.activity, activity)
@@ -99,6 +101,14 @@ def test_unreadable_file_is_refused(tmp_path):
     np.savez(tmp_path / "gap.npz", a=np.array([1.0, np.nan]), b=np.arange(2))
     np.savez(tmp_path / "trial.npz", a=np.arange(2), trial=np.array([1.0, np.nan]))
     np.savez(tmp_path / "text.npz", a=np.array(["x", "y"]), b=np.arange(2))
+    np.savez(tmp_path / "trials.npz", emg=emg(4), trial=np.arange(3))
+    (tmp_path / "renamed.npz").write_bytes((tmp_path / "cube.npy").read_bytes())
+    whole = (tmp_path / "two.npz").read_bytes()
+    first = whole.index(b"PK\x01\x02")  # of the table of contents, which counts
+    for name, at, byte in (("locked", first + 8, 1), ("method", first + 10, 99)):
+        (tmp_path / f"{name}.npz").write_bytes(whole[:at] + bytes([byte]) + whole[at + 1 :])
+    vast = (tmp_path / "cube.npy").read_bytes().replace(b"(2, 3, 4), }    ", b"(200000000, 99999)}")
+    (tmp_path / "vast.npy").write_bytes(vast)
     (tmp_path / "cut.npz").write_bytes((tmp_path / "two.npz").read_bytes()[:200])
     (tmp_path / "latin.csv").write_bytes("a,\xe4\n1,2\n".encode("latin-1"))
     (tmp_path / "emg.mat").write_bytes(b"x")
@@ -111,7 +121,12 @@ def test_unreadable_file_is_refused(tmp_path):
         "gap.npz": "'a' in .* has no value in row 1;",
         "trial.npz": "which trial row 1 is of",
         "text.npz": "'a' in .* of type",
+        "trials.npz": "3 entries of 'trial' for the 4 rows of emg",
+        "renamed.npz": r"shape \(2, 3, 4\)",
         "cut.npz": "does not hold arrays of numbers",
+        "locked.npz": r"does not hold arrays of numbers \(.*encrypted",
+        "method.npz": "does not hold arrays of numbers",
+        "vast.npy": r"does not hold arrays of numbers \(.*allocate",
         "latin.csv": "not a text in UTF-8",
         "emg.mat": "pass a .csv, .npy or .npz file",
         "none.csv": "no file",

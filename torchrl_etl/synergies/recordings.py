@@ -6,6 +6,7 @@ import csv
 import os
 import re
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,14 +72,16 @@ def read_recording(
         (('soleus', 'tibialis'), (2, 2), None)
     """
     path = Path(path)
-    readers = {".csv": _read_csv, ".npy": _read_npy, ".npz": _read_npz}
-    if path.suffix.lower() not in readers:
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".npy", ".npz"):
         raise ValueError(
             f"{path} is not a recording that can be read; pass a .csv, .npy or .npz file."
         )
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}; pass the path of a recording.")
-    columns, lines = readers[path.suffix.lower()](path)
+    columns, lines = (
+        _read_csv(path) if suffix == ".csv" else (_read_numpy(path, trial or "trial"), None)
+    )
     for name in (named := Counter(name for name, _ in columns)):
         if named[name] > 1:
             raise ValueError(f"{path} has {named[name]} columns {name!r}; give each its own name.")
@@ -153,12 +156,10 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[
     return rows
 
 
-def _read_npy(path: Path) -> tuple[Columns, Lines]:
-    return _columns(path, _load(path)), None
-
-
-def _read_npz(path: Path) -> tuple[Columns, Lines]:
+def _read_numpy(path: Path, trial: str) -> Columns:
     archive = _load(path)
+    if isinstance(archive, np.ndarray):
+        return _columns(path, archive)
     matrices = [name for name, array in archive.items() if array.ndim == 2]
     if not matrices:
         columns = [pair for pair in archive.items() if pair[1].ndim == 1]
@@ -167,7 +168,7 @@ def _read_npz(path: Path) -> tuple[Columns, Lines]:
                 f"The arrays of {path} have {' and '.join(map(str, sorted(lengths)))} rows; they "
                 "must have as many as each other."
             )
-        return columns, None
+        return columns
     if len(matrices) > 1:
         raise ValueError(
             f"{path} has the arrays {', '.join(matrices)}; keep the one that holds a column for "
@@ -180,8 +181,13 @@ def _read_npz(path: Path) -> tuple[Columns, Lines]:
             f"{path} has {names.size} names for the {matrix.shape[1]} columns of {matrices[0]}; "
             "pass one for each."
         )
+    if trial in archive and archive[trial].shape != matrix.shape[:1]:
+        raise ValueError(
+            f"{path} has {archive[trial].size} entries of {trial!r} for the {len(matrix)} rows of "
+            f"{matrices[0]}; pass one for each."
+        )
     beside = [pair for pair in archive.items() if pair[1].shape == matrix.shape[:1]]
-    return _columns(path, matrix, names) + beside, None
+    return _columns(path, matrix, names) + beside
 
 
 def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
@@ -190,8 +196,18 @@ def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
         if not isinstance(loaded, np.lib.npyio.NpzFile):
             return loaded
         with loaded:
-            return {name: loaded[name] for name in loaded.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            found = {name: loaded[name] for name in loaded.files}
+            # Of a file that is no array, NumPy hands out the bytes.
+            return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    # A damaged archive can ask for a password, an unknown compression or all memory.
+    except (
+        ValueError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+        RuntimeError,
+        MemoryError,
+    ) as error:
         raise ValueError(
             f"{path} does not hold arrays of numbers ({error}); save it with numpy.save or "
             "numpy.savez, without objects."
@@ -199,14 +215,15 @@ def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
 
 
 def _columns(path: Path, array: np.ndarray, names: np.ndarray | None = None) -> Columns:
-    if array.dtype.names:
+    if array.dtype.names and array.ndim == 1:
         return [(name, array[name]) for name in array.dtype.names]
     if array.ndim != 2:
         raise ValueError(
             f"{path} holds an array of shape {array.shape}; it must be [rows, muscles]."
         )
     width = array.shape[1]
-    named = [f"muscle_{i}" for i in range(width)] if names is None else map(str, names)
+    # Text in bytes, as of fixed width, is text.
+    named = [f"muscle_{i}" for i in range(width)] if names is None else names.astype(str).tolist()
     return list(zip(named, array.T, strict=True))
 
 
