@@ -31,6 +31,7 @@ from torchrl_etl.analysis import (
 from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.io import write_atomically
+from torchrl_etl.modules.recorded_actions import LEAST_REACH
 from torchrl_etl.synergies import (
     SYNERGY_MODELS,
     Recording,
@@ -133,6 +134,13 @@ def load(config: DictConfig) -> Recording:
                 f"{config[bound]:g}; give low= and high= in the recording's units or "
                 "normalize=true, or leave out what is no muscle with leave_out=."
             )
+    largest = recording.activity.max()
+    if largest - config.low < LEAST_REACH * (config.high - config.low):
+        raise ValueError(
+            f"no muscle is above {largest:g}, so near to low={config.low:g} for high="
+            f"{config.high:g} that no bundle could follow; give low= and high= in the recording's "
+            "units or normalize=true."
+        )
     return recording
 
 

@@ -121,6 +121,12 @@ def test_fit_refuses_one_row_and_warns_of_identical_rows(use):
         assert numbers(use(gmvae(), np.zeros((9, 4)))).isfinite().all()
 
 
+@pytest.mark.parametrize("use", USES[:2])
+def test_actions_in_far_smaller_units_than_the_bounds_are_warned_of(use):
+    with pytest.warns(UserWarning, match="give the model low= and high= in the units"):
+        use(gmvae(), 1e-3 * np.abs(ACTIONS) - 1)
+
+
 def test_one_action_is_enough_to_encode():
     assert SynergyDecoder.from_gmvae(gmvae()).encode(ACTIONS[0]).shape == (2,)
 

@@ -143,6 +143,8 @@ def test_folds_keep_trials_together_and_are_balanced():
     assert len(held_out_rows(10, folds=9, trials=trials)) == 4
     with pytest.raises(ValueError, match="All rows are of trial a"):
         held_out_rows(3, trials=["a"] * 3)
+    with pytest.raises(ValueError, match="Row 2 has no trial"):
+        held_out_rows(4, trials=[0.0, 1.0, np.nan, 1.0])
 
 
 class Mean:
@@ -221,6 +223,7 @@ def test_command_writes_table_bundle_and_pictures(tmp_path, monkeypatch, capsys)
         (["num=a..b"], "num is 'a..b'"),
         (["num=[7,8]"], "more than the 6 muscles"),
         (["high=0.5"], "beyond high=0.5; give low= and high="),
+        (["high=1000"], "so near to low=0 for high=1000 that no bundle could follow; give low="),
         (["trial=subject"], "no column 'subject'"),
         (["leave_out=m0"], "leave_out is 'm0'; it must be a list"),
         (["data=null"], "no recording is named"),

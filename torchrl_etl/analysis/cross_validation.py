@@ -47,7 +47,7 @@ def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) ->
         list of np.ndarray: row indices of each fold; every row is in exactly one.
 
     Raises:
-        ValueError: if there are fewer than two folds, trials or rows.
+        ValueError: if there are fewer than two folds, trials or rows, or a row has no trial.
 
     Examples:
         >>> [part.tolist() for part in held_out_rows(5, folds=2)]
@@ -61,6 +61,8 @@ def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) ->
     trials = np.asarray(trials)
     if trials.shape != (rows,):
         raise ValueError(f"{len(trials)} trials came for {rows} rows; pass one for each row.")
+    if (missing := np.flatnonzero(trials != trials)).size:  # NaN is no trial, not even its own
+        raise ValueError(f"Row {missing[0]} has no trial; name it, or leave the row out.")
     names, sizes = np.unique(trials, return_counts=True)
     if len(names) < 2:
         raise ValueError(

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 
-__all__ = ["as_actions", "as_bounds", "bounds_of"]
+__all__ = ["LEAST_REACH", "as_actions", "as_bounds", "bounds_of"]
 
 # Recordings overshoot their bounds a little: filters ring, and estimates are noisy.
 OVERSHOOT = 0.1
+# Of the way from the lower bound to the upper: closer to the lower one decoders are flat.
+LEAST_REACH = 0.05
 
 
 def as_actions(
@@ -30,7 +32,8 @@ def as_actions(
     Keyword Args:
         low, high (Tensor): action bounds [n]. Values may exceed them by a tenth of the range.
         min_rows (int): if above 0, require this many rows, return [N, n], and warn if all rows
-            are equal. Default: 0.
+            are equal or so close to the lower bound that their unit must differ from the bounds'.
+            Default: 0.
 
     Raises:
         TypeError: if the actions are not real numbers.
@@ -76,6 +79,13 @@ def as_actions(
     if bool((rows == rows[0]).all()):
         warnings.warn(
             f"The {len(rows)} actions are all alike, so there are no synergies in them.",
+            stacklevel=3,
+        )
+    elif (reach := float(((rows - low) / (high - low)).max())) < LEAST_REACH:
+        warnings.warn(
+            f"The actions keep within {reach:.2g} of the way from their lower to their upper "
+            "bound, where a decoder of synergies cannot follow them; give the model low= and high= "
+            "in the units of the actions.",
             stacklevel=3,
         )
     return rows
