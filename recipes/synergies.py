@@ -32,8 +32,8 @@ from torchrl_etl.checks import check_choice, check_flag, check_integer, check_re
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH
+from torchrl_etl.own_conf import group_files
 from torchrl_etl.synergies import (
-    SYNERGY_MODELS,
     Recording,
     SynergyModel,
     fit_synergies,
@@ -204,7 +204,8 @@ if __name__ == "__main__":
     with one_sentence(ValueError):
         for i, argument in enumerate(arguments):
             if argument.startswith("kind="):
-                check_choice("kind", kind := argument.removeprefix("kind="), list(SYNERGY_MODELS))
+                kinds = list(group_files(CONF, "synergies"))  # one's own, too
+                check_choice("kind", kind := argument.removeprefix("kind="), kinds)
                 arguments[i] = f"synergies={kind}"
     sys.argv[1:] = quote_paths(arguments, "data", "out")
     check_overrides(CONF / "recording.yaml", sys.argv[1:], __doc__, short=["kind"])

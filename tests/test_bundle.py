@@ -130,7 +130,9 @@ DAMAGE = {
     "5 as task where a JSON string belongs": lambda f: edit(f, task=5),
     "do not make a SynergyDecoder": widen,
     "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
-    "states 1 actuators": lambda f: edit(f, actuators=["biceps"]),
+    "synergies of 1 actuators": lambda f: edit(f, actuators=["biceps"]),
+    "states 99 synergies": lambda f: edit(f, num_synergies=99),
+    "actuators that are no JSON strings": lambda f: edit(f, actuators=[1, 2, 3]),
     "There is no synergy bundle": shutil.rmtree,
 }
 

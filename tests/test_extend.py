@@ -7,6 +7,7 @@ import shlex
 import sys
 from typing import ClassVar
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -212,6 +213,12 @@ def test_random_synergies_fit_recordings_worse_than_nmf(page_files, capsys):
     exec(code, {"__name__": "__main__"})
     nmf, at_random = (float(line.split()[-1]) for line in capsys.readouterr().out.splitlines())
     assert nmf > 0.99 > at_random > 0
+
+
+def test_synergies_recipe_accepts_the_random_kind(page_files, capsys):
+    np.save("emg.npy", np.random.default_rng(0).random((40, 4)))
+    assert command("synergies.py", "data=emg.npy", "kind=random", "num=2", "out=found") == 0
+    assert "2 synergies account for" in capsys.readouterr().out
 
 
 def test_thrift_method_runs_and_resumes_with_equal_numbers(page_files, tmp_path):

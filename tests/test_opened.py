@@ -145,6 +145,14 @@ def test_bundle_cannot_import_a_module(finished, tmp_path):
     assert open_bundle(folder, "overactuated").task.name == "overactuated"
 
 
+def test_a_bundle_of_a_recording_is_shown_on_the_task_that_is_named(tmp_path):
+    muscles = actuator_names("overactuated")
+    folder = save_bundle(SynergyDecoder(2, 16), tmp_path / "a", task="emg", actuators=muscles)
+    with pytest.raises(BundleError, match="is of 'emg', which is no task; pass env=TASK"):
+        open_bundle(folder)
+    assert open_bundle(folder, "overactuated").task.name == "overactuated"
+
+
 @pytest.mark.parametrize("fault", [SimulationError, gymnasium.error.DependencyNotInstalled])
 @pytest.mark.parametrize(
     ("recipe", "opening"),

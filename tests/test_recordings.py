@@ -11,7 +11,7 @@ import torch
 
 from tests.commands import command
 from torchrl_etl.analysis import cross_validate, held_out_rows, variance_accounted_for
-from torchrl_etl.synergies import fit_synergies, load_bundle, read_recording
+from torchrl_etl.synergies import NMFSynergies, fit_synergies, load_bundle, read_recording
 
 MUSCLES = tuple(f"m{i}" for i in range(6))
 
@@ -239,4 +239,16 @@ def test_invalid_setting_of_the_command_is_refused(arguments, words, tmp_path, m
     path = write(tmp_path / "emg.csv", emg(20))
     assert command("synergies.py", f"data={path}", *arguments) != 0
     assert words in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["emg.csv"]
+
+
+def test_ctrl_c_is_no_traceback_and_leaves_nothing(tmp_path, monkeypatch, capsys):
+    def interrupt(*given, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(NMFSynergies, "fit", interrupt)
+    path = write(tmp_path / "emg.csv", emg(20))
+    assert command("synergies.py", f"data={path}", "kind=nmf", "num=2") == 130
+    assert capsys.readouterr().err == "Stopped.\n"
     assert [file.name for file in tmp_path.iterdir()] == ["emg.csv"]

@@ -165,9 +165,12 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
 
 @contextmanager
 def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
-    """Print an error of these kinds as one line and exit with code 2."""
+    """Print an error of these kinds as one line and exit with code 2; Ctrl-C exits with 130."""
     try:
         yield
+    except KeyboardInterrupt:
+        print("Stopped.", file=sys.stderr)
+        sys.exit(130)
     except kinds as error:
         print(f"Error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -76,6 +76,13 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
         remedy = f"pass env={info.task} yourself if you trust it"
         check_imported(info.task, f"The task of {bundle}", BundleError, remedy)
         env = info.task
+        try:
+            resolve_task(env)
+        except ValueError as error:  # of a recording, say
+            raise BundleError(
+                f"The bundle {bundle} is of {info.task!r}, which is no task; pass env=TASK, one of "
+                "its body."
+            ) from error
     task = resolve_task(env, goal)
     spec = EnvironmentSpec.of(make_env(env, goal=goal))
     check_compatible(info, spec.actuators, spec.low, spec.high)

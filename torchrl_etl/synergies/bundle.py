@@ -194,11 +194,12 @@ def load_bundle(
         ) from error
     decoder.carry(encoder)
     bounds = tuple(decoder.low.tolist()), tuple(decoder.high.tolist())
-    if bounds != (info.low, info.high) or decoder.action_dim != len(info.actuators):
+    sizes = decoder.num_synergies, decoder.action_dim
+    if bounds != (info.low, info.high) or sizes != (info.num_synergies, len(info.actuators)):
         raise BundleError(
-            f"{DESCRIPTION} in {str(folder)!r} states {len(info.actuators)} actuators or bounds "
-            f"that its decoder of {decoder.action_dim} actuators does not have; it was edited, so "
-            "copy the bundle again."
+            f"{DESCRIPTION} in {str(folder)!r} states {info.num_synergies} synergies of "
+            f"{len(info.actuators)} actuators, or bounds, that its decoder of {sizes[0]} synergies "
+            f"of {sizes[1]} actuators does not have; it was edited, so copy the bundle again."
         )
     return decoder, info
 

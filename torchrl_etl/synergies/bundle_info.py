@@ -100,6 +100,8 @@ def read_description(folder: Path) -> BundleInfo:
                 f"{path} has {content[key]!r} as {key} where a JSON {named} belongs; copy the "
                 "bundle again."
             )
+    if not all(isinstance(name, str) for name in content["actuators"]):
+        raise BundleError(f"{path} has actuators that are no JSON strings; copy the bundle again.")
     if version == 1:
         content["kind"] = default_kind(not content["config"].get("hidden", True))
     if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
