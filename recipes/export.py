@@ -42,6 +42,8 @@ def main(config: DictConfig) -> None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         check_choice("part", config.part, ("all", "synergies"))
         check_integer(1, episodes=config.episodes)
+        if "/" in str(config.name):  # and the entry would be made somewhere else
+            raise ValueError(f"name is {config.name!r}; it must be no path; pass out= for one.")
         run = Path(config.run)
         trained = resumed_config(run, defaults=compose())
         task = resolve_task(trained.env, trained.goal)

@@ -20,6 +20,7 @@ from torchrl_etl.io import own_folder, read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.own_code import check_imported
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
+from torchrl_etl.synergies.bundle_info import some
 from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
 from torchrl_etl.zoo.policy import make_policy
 
@@ -309,8 +310,8 @@ def _check_env(folder: Path, card: Card, found: EnvironmentSpec) -> None:
         )
     if list(found.actuators) != card.actuators:
         raise ZooError(
-            f"{has} moves {len(card.actuators)} actuators ({card.actuators[0]}, ...) that are not "
-            f"the environment's {found.action_dim} ({found.actuators[0]}, ...) by name and order; "
+            f"{has} moves {len(card.actuators)} actuators ({some(card.actuators)}) that are not "
+            f"the environment's {found.action_dim} ({some(found.actuators)}) by name and order; "
             "use it on its own body."
         )
     for side in ("low", "high"):
