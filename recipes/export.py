@@ -9,6 +9,7 @@ with their defaults:
 
 from __future__ import annotations
 
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -50,7 +51,8 @@ def main(config: DictConfig) -> None:
         name = config.name or task.name.rpartition("/")[2] + "-random" * (task.goal == "random")
         target = Path(config.out or f"zoo/{name}").expanduser()
         if config.part == "synergies":
-            print(f"Synergies of {trained.env}, for synergies=zoo:{copy_bundle(run, target)}")
+            setting = shlex.quote(f"synergies=zoo:{copy_bundle(run, target)}")
+            print(f"Synergies of {trained.env}, for {setting}")
             return
         card = export_run(run, target, compose, CONF, episodes=config.episodes)
     size = sum(path.stat().st_size for path in target.iterdir())

@@ -138,10 +138,11 @@ def test_cuda_without_a_device_is_refused():
 
 
 def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
-    experiment = Experiment(tiny(f"run_dir='{tmp_path}/run'"))
+    experiment = Experiment(tiny(f"run_dir='{tmp_path}/my run'"))
     experiment.folder.open(resume=False)
-    with pytest.raises(FileExistsError, match="already holds a run; go on with it by resume="):
-        Experiment(tiny(f"run_dir='{tmp_path}/run'")).run()
+    as_a_shell_takes_it = f"go on with it by 'resume={tmp_path}/my run', or"
+    with pytest.raises(FileExistsError, match=re.escape(as_a_shell_takes_it)):
+        Experiment(tiny(f"run_dir='{tmp_path}/my run'")).run()
 
 
 def test_unwritable_run_folder_is_refused(tmp_path):

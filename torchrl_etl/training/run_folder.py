@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import platform
+import shlex
 import subprocess
 import uuid
 from collections.abc import Mapping, Sequence
@@ -61,9 +62,10 @@ class RunFolder:
             # Checked under the lock: another run may have started and finished meanwhile.
             if (self.path / "config.yaml").exists() and not resume:
                 self._lock.release()
+                setting = shlex.quote(f"resume={self.path}")  # as a shell takes it
                 raise _HoldsARun(
-                    f"{self.path} already holds a run; go on with it by resume={self.path}, or "
-                    "choose another run_dir."
+                    f"{self.path} already holds a run; go on with it by {setting}, or choose "
+                    "another run_dir."
                 )
             write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
         except _HoldsARun:
