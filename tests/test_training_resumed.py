@@ -137,3 +137,10 @@ def test_allowed_overrides_on_resume_are_applied(file):
 def test_learn_frames_on_resume_replaces_frames(file):
     resumed = resumed_config(file.parent, ["learn.frames=900"])
     assert resumed.frames is None and resumed.learn.frames == 900
+
+
+def test_a_budget_of_exploring_is_refused_once_that_is_over(file):
+    assert resumed_config(file.parent, ["explore.frames=64"]).explore.frames == 64
+    (file.parent / "synergies").mkdir()
+    with pytest.raises(ValueError, match=r"has its synergies: nothing heeds explore\.frames now"):
+        resumed_config(file.parent, ["explore.frames=64"])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_etl.extras import extra
+from torchrl_etl.io import surviving_folder
 from torchrl_etl.training.config import MAY_CHANGE, OPEN_SECTIONS, PRESETS, RENAMED
 
 with extra("recipes"):
@@ -42,7 +43,7 @@ def resumed_config(
 
     Raises:
         ValueError: if the folder holds no run, its configuration is damaged, or an override is
-            unknown or not allowed in a resume.
+            unknown, not allowed in a resume, or for stage 1 after its end.
     """
     config = _stored(Path(folder) / "config.yaml")
     newer = {} if defaults is None else dict(_missing(config, defaults))
@@ -53,6 +54,9 @@ def resumed_config(
     for override in parsed:
         _override(config, override, newer)
     keys = {override.key_or_group for override in parsed}
+    over = surviving_folder(Path(folder) / "synergies").exists()
+    if over and (late := sorted(key for key in keys if key.startswith("explore."))):
+        raise ValueError(f"{folder} has its synergies already; leave {late[0]} out.")
     if {"frames", "learn.frames"} <= keys:
         raise ValueError("frames and learn.frames were given, and each sets the budget; give one.")
     if "learn.frames" in keys:  # the setting given now takes precedence
