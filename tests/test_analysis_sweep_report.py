@@ -57,6 +57,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
     rows += run([-300, 0, 7777], seed=9, method="etl", status="killed: out of memory")
     rows += run([1, 5, 44], seed=0, task="dog-run", method="dep", machine="other | class")
     rows += run([1, 2], seed=0, task="dog-walk", method="eme", status="diverged")
+    rows += run([""], seed=1, task="dog-walk", method="eme", status="failed")  # no evaluation
     rows += run([1, 5, 21], seed=1, task="dog-run")  # a repeat
     folder, out = write(tmp_path / "a sweep", rows), tmp_path / "new" / "report"
     report(f"results={folder}", f"out={out}")
@@ -76,6 +77,8 @@ def test_report_from_end_to_end(tmp_path, capsys):
         "unequal numbers of seeds",
         "- myoHandKeyTurn (fixed), etl, seed 9: killed: out of memory, last evaluated at 100,000",
         "- dog-walk (fixed), eme, seed 0: diverged, last evaluated at 50,000 frames",
+        "- dog-walk (fixed), eme, seed 1: failed, no evaluation",
+        f"{len(rows) - 1} evaluations of {13} runs",
         "| fff0000 | 3 |",
         "| other \\| class | 1 |",
         "| torch | 2.13.0 | 10 |",

@@ -142,5 +142,5 @@ def test_learn_frames_on_resume_replaces_frames(file):
 def test_a_budget_of_exploring_is_refused_once_that_is_over(file):
     assert resumed_config(file.parent, ["explore.frames=64"]).explore.frames == 64
     (file.parent / "synergies").mkdir()
-    with pytest.raises(ValueError, match=r"has its synergies: nothing heeds explore\.frames now"):
+    with pytest.raises(ValueError, match=r"has its synergies already; leave explore\.frames out"):
         resumed_config(file.parent, ["explore.frames=64"])

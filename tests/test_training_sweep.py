@@ -90,6 +90,10 @@ def test_failing_run_is_retried_and_then_given_up(tmp_path):
         pass
     assert sweep.status(run) == "failed" and run.starts == 2
     assert (run.path / "log.txt").read_text().count("it broke") == 2
+    (row,) = results(tmp_path / "out")  # nobody takes it for one that was not asked for
+    assert (row["seed"], row["return"], row["status"]) == ("0", "", "failed")
+    Sweep([run], tmp_path / "out", jobs=1).stop()
+    assert len(results(tmp_path / "out")) == 1
 
 
 @pytest.mark.parametrize("summary", ["{}", '{"learn": {"frames_charged": 9}}'])

@@ -218,7 +218,8 @@ def _unfinished(sweep: SweepResults) -> list[str]:
         return ["None."]
     return [
         "\n".join(
-            f"- {run}: {run.status}, last evaluated at {run.last_frames:,} frames"
+            f"- {run}: {run.status}, "
+            + (f"last evaluated at {run.last_frames:,} frames" if run.evaluated else "no evaluation")
             for run in sweep.unfinished
         )
     ]

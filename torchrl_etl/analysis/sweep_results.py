@@ -87,6 +87,10 @@ class SweepRun:
     def last_frames(self) -> int:
         return self.rows[-1].frames
 
+    @property
+    def evaluated(self) -> bool:
+        return any(math.isfinite(row.mean_return) for row in self.rows)
+
     def at(self, frames: int) -> SweepRow | None:
         """The last evaluation up to 1 % past ``frames``.
 
@@ -111,7 +115,7 @@ class SweepResults:
 
     Attributes:
         runs: All runs, including unfinished ones.
-        row_count: Number of rows in the file.
+        row_count: Number of evaluations in the file.
         replaced: Number of rows superseded by a repeated run.
     """
 
@@ -173,7 +177,8 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
                     f"{path}, line {row.line}: {run} is finished but this evaluation has no finite "
                     "return; mend the row, or give the run's last row another status."
                 )
-    return SweepResults(runs, len(rows), len(rows) - kept)
+    evaluations = sum(math.isfinite(row.mean_return) for row in rows)
+    return SweepResults(runs, evaluations, len(rows) - kept)
 
 
 def _runs(rows: list[SweepRow]) -> tuple[SweepRun, ...]:

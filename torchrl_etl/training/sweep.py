@@ -224,7 +224,8 @@ class Sweep:
                 f"Another queue works in {self.folder}; wait for it, or give another folder."
             ) from None
         # Rows of earlier queues, perhaps copied from other machines without the run folders.
-        self._earlier = self._read()
+        own = {run.key for run in runs}
+        self._earlier = [row for row in self._read() if row["return"] or _key(row) not in own]
         ended = (row for row in self._earlier if row["status"] == "finished")
         self._done = {_key(row): float(row["frames"]) for row in ended}  # frames of the last row
 
@@ -281,9 +282,17 @@ class Sweep:
         self._lock.release()
 
     def write(self) -> None:
-        """Write one row per evaluation of every run, and keep rows of other runs in the table."""
+        """Write one row per evaluation of every run, and keep rows of other runs in the table.
+
+        A run without an evaluation that has not finished gets a row without a return.
+        """
         rows = [row for run in self.runs for row in run.rows(self.status(run))]
         mine = {_key(row) for row in rows}
+        known = mine | {_key(row) for row in self._earlier}
+        for run in self.runs:
+            if run.key not in known and (status := self.status(run)) != "finished":
+                own = dict(zip(KEY, run.key, strict=True))
+                rows.append(own | {"frames": 0, "status": status})
         text = io.StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
         writer.writeheader()
