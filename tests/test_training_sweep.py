@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -144,6 +145,19 @@ def test_run_finished_in_results_csv_is_not_started(tmp_path):
         pass
     assert run.starts == 0
     assert (tmp_path / "out" / "results.csv").read_text() == text
+
+
+def test_row_has_the_commit_of_the_start_that_logged_it(tmp_path):
+    run = small_run(tmp_path, "")
+    log = run.path / "csv" / "scalars" / "learn" / "eval" / "return.csv"
+    log.parent.mkdir(parents=True)
+    log.write_text("320,1.0\n520,2.0\n720,3.0\n")
+    (run.path / "config.yaml").write_text("evaluation: {episodes: 2}")
+    saved = [{}, {"explore": 320}, {"explore": 320, "learn": 200}]
+    starts = [{"commit": name, "machine": "m"} for name in "abc"]
+    starts = [one | {"saved": each} for one, each in zip(starts, saved, strict=True)]
+    (run.path / "versions.json").write_text(json.dumps(starts))
+    assert [row["commit"] for row in run.rows("finished")] == ["b", "b", "c"]
 
 
 def test_closing_the_sweep_ends_its_runs(tmp_path):

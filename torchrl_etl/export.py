@@ -68,7 +68,8 @@ def export_run(
     described = describe_policy(experiment, learner)
     policy = rebuilt(learner.policy, described)
     result = evaluate_task(policy, context.make_env(), context.task, episodes=episodes)
-    starts = experiment.folder.versions or [{}]
+    start = (experiment.folder.versions or [{}])[-1]
+    start.pop("saved", None)
     card = Card(
         task={**context.task, "goal": experiment.task.goal},
         actuators=list(context.spec.actuators),
@@ -77,8 +78,8 @@ def export_run(
             "method": experiment.config.method.name,
             "frames": experiment.method.frames_before() + stage.frames,
             "seed": experiment.config.seed,
-            "commit": starts[-1].pop("commit", None),
-            "versions": starts[-1],
+            "commit": start.pop("commit", None),
+            "versions": start,
             "command": command_of(experiment.config, compose, groups, target.name),
         },
         evaluation=result.summary(),

@@ -216,13 +216,11 @@ def _method_row(result: MethodResult, solved: bool) -> tuple[str, ...]:
 def _unfinished(sweep: SweepResults) -> list[str]:
     if not sweep.unfinished:
         return ["None."]
-    return [
-        "\n".join(
-            f"- {run}: {run.status}, "
-            + (f"last evaluated at {run.last_frames:,} frames" if run.evaluated else "no evaluation")
-            for run in sweep.unfinished
-        )
-    ]
+    lines = []
+    for run in sweep.unfinished:
+        last = f"last evaluated at {run.last_frames:,} frames" if run.evaluated else "no evaluation"
+        lines.append(f"- {run}: {run.status}, {last}")
+    return ["\n".join(lines)]
 
 
 def _origins(sweep: SweepResults) -> list[str]:

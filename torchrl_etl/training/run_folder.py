@@ -80,7 +80,7 @@ class RunFolder:
                 "run_dir or mend its permissions."
             ) from error
         # One entry per start: a run may be resumed on another machine or commit.
-        self.write_json("versions.json", [*self.versions, facts()])
+        self.write_json("versions.json", [*self.versions, {**facts(), "saved": self.saved}])
 
     def close(self) -> None:
         """Release the lock on the folder."""
@@ -107,7 +107,7 @@ class RunFolder:
 
     @property
     def versions(self) -> list[dict[str, Any]]:
-        """The :func:`facts` of each start."""
+        """The :func:`facts` of each start, with what was saved by then."""
         return self._read_json("versions.json", [])
 
     @property

@@ -130,21 +130,30 @@ class Run:
         folder = self.folder
         if folder is None or not (starts := folder.versions):
             return
-        facts = starts[-1]
-        own = {"commit": facts.pop("commit"), "machine": facts.pop("machine")}
-        own |= {"versions": json.dumps(facts), "status": status}
-        own |= {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
+        own = {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
+        own |= {"status": status}
         before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
         own["episodes"] = self.episodes
         series = {
             key: dict(zip(*folder.series(f"learn/eval/{key}"), strict=True))
             for key in ("return", "solved", "solved_time", "wall_seconds")
         }
+        begun = min(series["return"], default=0)
         for frames in sorted(series["return"]):
             row = own | {"frames": frames} | {k: v.get(frames) for k, v in series.items()}
+            row |= _made_with(starts, frames - begun)
             if row["wall_seconds"] is not None:
                 row["wall_seconds"] += before
             yield row
+
+
+def _made_with(starts: Sequence[Mapping[str, Any]], frames: int) -> dict[str, str]:
+    """What stood at the last start before so many frames of learning."""
+    before = [each for each in starts if each.get("saved", {}).get("learn", -1) < frames]
+    own = dict((before or starts)[-1])
+    own.pop("saved", None)
+    made_with = {name: own.pop(name) for name in ("commit", "machine")}
+    return made_with | {"versions": json.dumps(own)}
 
 
 def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
