@@ -10,7 +10,7 @@ from tests.commands import begun, wait_until
 from tests.configs import ROOT, TINY, tiny
 from tests.runs import has_saved, numbers
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.in_processes import in_processes
+from torchrl_etl.in_processes import _sendable, in_processes
 
 SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")
 
@@ -25,6 +25,16 @@ def test_each_process_equals_a_single_run_and_survives_a_failed_one(tmp_path, ca
     assert isinstance(fault, OSError) and str(tmp_path / "1") in str(fault)
     Experiment(tiny(f"run_dir='{tmp_path}/alone'", "seed=0", *SHORT)).run()
     assert numbers(folder) == numbers(tmp_path / "alone")
+
+
+class Broken(Exception):
+    def __init__(self, joint, angle):
+        super().__init__(f"{joint} at {angle}")
+
+
+def test_an_error_that_cannot_be_made_again_is_told_in_its_words():
+    assert str(_sendable(Broken("knee", 3))) == "Broken: knee at 3"
+    assert isinstance(_sendable(OSError("full")), OSError)
 
 
 def children(process: int) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import traceback
 from collections.abc import Mapping, Sequence
@@ -79,10 +80,19 @@ def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
         try:
             end = alone(experiment.work(stop))
         except (Exception, Interrupted) as error:
-            error.add_note(traceback.format_exc())
-            end = error
+            end = _sendable(error)
+            end.add_note(traceback.format_exc())
     with suppress(BrokenPipeError):  # the parent was killed
         sender.send((experiment.folder.path, end))
+
+
+def _sendable(error: BaseException) -> BaseException:
+    """The error, or its words where another process could not make it again."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # an environment's own class with arguments of its own, say
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error
 
 
 def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
