@@ -57,7 +57,7 @@ def main(config: DictConfig) -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, signal.default_int_handler)
     try:
-        with Live(display.table(), refresh_per_second=1) as live:
+        with one_sentence(OSError), Live(display.table(), refresh_per_second=1) as live:
             for _ in sweep:
                 live.update(display.table())
     except KeyboardInterrupt:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from tests.configs import tiny
 from tests.runs import killed_when_saved, numbers, stopped
@@ -17,8 +18,9 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_folder
-from torchrl_etl.training.run_folder import facts
+from torchrl_etl.training.run_folder import RunFolder, facts
 
+FULL = Path("/dev/full")
 ONLY_AT_THE_END = "checkpoint.every=100000"
 
 
@@ -119,6 +121,17 @@ def test_resume_names_a_damaged_file_and_works_without_it(name, content, copy):
         (copy / "away").rename(away)
     file.unlink()
     assert resume(copy)["learn"]["frames"] == 608
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="Linux has a disk that is always full")
+def test_full_disk_error_names_the_run(tmp_path):
+    folder = RunFolder(tmp_path, OmegaConf.create({"log": []}))
+    file = tmp_path / "csv" / "scalars" / "learn" / "return.csv"
+    file.parent.mkdir(parents=True)
+    file.symlink_to(FULL)
+    words = rf"{tmp_path} logs cannot be written \(No space left.*resume={tmp_path}\."
+    with pytest.raises(OSError, match=words):
+        folder.log({"learn/return": 1.0}, 5)
 
 
 def test_resume_drops_a_truncated_row(copy):

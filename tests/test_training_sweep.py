@@ -160,6 +160,18 @@ def test_row_has_the_commit_of_the_start_that_logged_it(tmp_path):
     assert [row["commit"] for row in run.rows("finished")] == ["b", "b", "c"]
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a disk that is always full")
+def test_full_disk_ends_the_queue_and_names_the_file(tmp_path):
+    run = tmp_path / "overactuated-sac-seed0"
+    run.mkdir()
+    (run / "summary.json").write_text("{}")
+    (tmp_path / ".results.csv.tmp").symlink_to("/dev/full")
+    what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0]", f"out={tmp_path}"]
+    ended = process("sweep.py", *what, cwd=tmp_path)
+    assert ended.returncode == 2 and "Traceback" not in ended.stderr
+    assert f"No space left on device: '{tmp_path}/.results.csv.tmp'" in ended.stderr
+
+
 def test_closing_the_sweep_ends_its_runs(tmp_path):
     run = small_run(tmp_path, "import time; time.sleep(600)")
     sweep = Sweep([run], tmp_path / "out", jobs=1)

@@ -152,10 +152,13 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def _write_to_disk(path: Path, content: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with path.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:  # a full disk does not say of itself which one
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def as_json(content: Any) -> str:

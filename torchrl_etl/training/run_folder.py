@@ -151,9 +151,15 @@ class RunFolder:
             # Summary and learning curves read the CSV files.
             names = dict.fromkeys(("csv", *self._config.log))
             self._loggers = [self._logger(name) for name in names]
-        for logger in self._loggers:
-            for key, value in values.items():
-                logger.log_scalar(key, float(value), step=frame)
+        try:
+            for logger in self._loggers:
+                for key, value in values.items():
+                    logger.log_scalar(key, float(value), step=frame)
+        except OSError as error:
+            raise OSError(
+                f"What {self.path} logs cannot be written ({error.strerror or error}); mend that, "
+                f"then go on with resume={self.path}."
+            ) from error
 
     def series(self, key: str) -> tuple[list[int], list[float]]:
         """Frames and values of ``key`` in the CSV log."""
