@@ -77,9 +77,6 @@ def main(config: DictConfig) -> None:
             trained.policy, trained.env, trained.task, episodes=config.episodes
         )
         result = {"env": trained.task["name"], "goal": task.goal, **evaluation.summary()}
-        trained.folder.mkdir(parents=True, exist_ok=True)
-        path = trained.folder / "evaluation.json"
-        write_atomically(path, as_json(result))
     print(
         f"{trained.task['name']}{task.goal_in_words}, deterministic policy, "
         f"{config.episodes} episodes"
@@ -87,6 +84,10 @@ def main(config: DictConfig) -> None:
     print_intervals(result)
     if trained.card is not None:
         print(f"  {beside(trained.card, evaluation)}")
+    path = trained.folder / "evaluation.json"
+    with one_sentence(OSError):  # now that the numbers are told
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, as_json(result))
     print(f"  written to {path}")
     if recorder is not None:
         with one_sentence(OSError, SimulationError), recorder:

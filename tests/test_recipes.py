@@ -86,6 +86,13 @@ def test_one_episode_is_printed_without_an_interval(capsys):
     assert capsys.readouterr().out == "  return       2.000\n"
 
 
+def test_evaluate_tells_its_numbers_where_it_cannot_write_them(tmp_path):
+    (tmp_path / "runs").write_text("a file where the folder should be")
+    ended = process("evaluate.py", "zoo=overactuated", "episodes=2", cwd=tmp_path)
+    assert ended.returncode == 2 and "return" in ended.stdout
+    assert ended.stderr.startswith("Error: ") and "Traceback" not in ended.stderr
+
+
 @pytest.mark.slow
 def test_evaluate_writes_videos_or_asks_for_a_gl_back_end(hand):
     done = process(
