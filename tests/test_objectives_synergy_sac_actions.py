@@ -121,7 +121,7 @@ def test_both_losses_use_the_current_decoder(loss, data) -> None:
 
 
 def test_entropy_includes_only_the_counted_coefficients(data) -> None:
-    loss = make_loss(residual=0.5, counted=SYNERGIES)
+    loss = make_loss(residual=0.5, entropy_dims=SYNERGIES)
     distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
     loc, scale = (part[..., :SYNERGIES] for part in (distribution.loc, distribution.scale))
     synergy, log_prob = seeded(loss._sample, data)

@@ -270,7 +270,7 @@ def test_entropy_excludes_a_residual_with_fixed_noise():
         stage = learn_stage(decoder, quiet, f"learn.sac.action_std={std}")
         sac = stage.learner.objective.sac
         assert sac.target_entropy.item() == pytest.approx(wanted, rel=1e-5)
-    assert sac.counted == 2
+    assert sac.entropy_dims == 2
     batch = stage.collect()
     assert (batch["scale"][:, 2:] == 0.05).all() and (batch["scale"][:, :2] != 0.05).all()
 

@@ -73,8 +73,8 @@ class SACLearner:
         ema_decay (float): EMA decay of the actor that is evaluated and saved. Default: 0.
         alpha_init (float): initial temperature. Default: 1.
         target_entropy (float or "auto"): see :func:`entropy_target`. Default: ``"auto"``.
-        counted (int, optional): measure the entropy of the first ``counted`` actor outputs only.
-            Default: entropy of the action.
+        entropy_dims (int, optional): measure the entropy of the first ``entropy_dims`` actor
+            outputs only. Default: entropy of the action.
         num_critics (int): ensemble size; targets and actor loss use the minimum. Default: 2.
         loss_function (str): loss of scalar critics. Default: ``"l2"``.
         return_bound (float, optional): scale rewards so that returns stay within ± this bound.
@@ -121,7 +121,7 @@ class SACLearner:
         ema_decay: float = 0.0,
         alpha_init: float = 1.0,
         target_entropy: float | Literal["auto"] = "auto",
-        counted: int | None = None,
+        entropy_dims: int | None = None,
         num_critics: int = 2,
         loss_function: str = "l2",
         return_bound: float | None = None,
@@ -140,7 +140,11 @@ class SACLearner:
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
         self.on_frames, self.on_restart = on_frames, on_restart
         decoded = {"action_spec": action_spec, "decoder": decoder, "train_decoder": train_decoder}
-        entropy = {"target_entropy": target_entropy, "counted": counted, "alpha_init": alpha_init}
+        entropy = {
+            "target_entropy": target_entropy,
+            "entropy_dims": entropy_dims,
+            "alpha_init": alpha_init,
+        }
         critics = {"num_critics": num_critics, "bins": bins, "loss_function": loss_function}
         scale = make_return_scale(gamma, return_bound)
         sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)

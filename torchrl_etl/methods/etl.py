@@ -273,16 +273,16 @@ class ETL(Method):
         with naming("learn.decoder"), renaming(weight="distillation_weight"):
             term = Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])
         # The policy does not control the entropy of a residual with fixed noise.
-        counted = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
+        entropy_dims = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder,
             make_actor=partial(make_actor, **self._quiet),
-            entropy=lambda emitted, std: entropy_target(emitted[:counted], std),
+            entropy=lambda emitted, std: entropy_target(emitted[:entropy_dims], std),
             more=lambda actor: {
                 "train_decoder": mode == "critic",
                 "terms": [term],
-                "counted": counted,
+                "entropy_dims": entropy_dims,
             },
         )
         room = self.context.config.explore.frames if self.prefills else 0

@@ -54,8 +54,8 @@ class LeanSACLoss(SACLoss):
             critics always minimize cross entropy. ``"l2"`` is the squared error, summed over
             critics; Stable-Baselines3 takes half of it. Default: ``"l2"``. TorchRL's is
             ``"smooth_l1"``, but only the square makes critics estimate the *mean* return.
-        counted (int, optional): measure the entropy of only the first ``counted`` entries of a
-            tanh-Gaussian sample, if the actor cannot choose the others' noise. Default: all.
+        entropy_dims (int, optional): measure the entropy of only the first ``entropy_dims`` entries
+            of a tanh-Gaussian sample, if the actor cannot choose the others' noise. Default: all.
         **kwargs: see :class:`torchrl.objectives.SACLoss`.
 
     Keys:
@@ -65,9 +65,9 @@ class LeanSACLoss(SACLoss):
         TypeError: if actor or critic is of the wrong class, or a ``value_network`` or
             ``skip_done_states`` is given.
         ValueError: for an unknown reduction or ``loss_function``, a support that is not evenly
-            spaced and ascending or not of the critics' size, ``counted`` with an actor that is no
-            tanh-Gaussian, an actor that samples several keys, or a critic with several outputs but
-            no ``state_action_value``.
+            spaced and ascending or not of the critics' size, ``entropy_dims`` with an actor that
+            is no tanh-Gaussian, an actor that samples several keys, or a critic with several
+            outputs but no ``state_action_value``.
 
     Examples:
         >>> import torch
@@ -101,7 +101,7 @@ class LeanSACLoss(SACLoss):
         *,
         support: Tensor | None = None,
         loss_function: Literal["l2", "l1", "smooth_l1"] = "l2",
-        counted: int | None = None,
+        entropy_dims: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_parts("actor_network", actor_network, ProbabilisticTensorDictSequential)
@@ -111,13 +111,13 @@ class LeanSACLoss(SACLoss):
                 f"The actor samples {sampled}; the parts of a composite action must lie under one "
                 "key: give it out_keys=['action'] and its distribution no name_map."
             )
-        if counted is not None:
-            check_integer(1, counted=counted)
+        if entropy_dims is not None:
+            check_integer(1, entropy_dims=entropy_dims)
             kind = actor_network[-1].distribution_class
             if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
                 raise ValueError(
-                    f"counted is {counted}, but the actor is no tanh-Gaussian; leave counted out, "
-                    "or give the actor TanhNormal as its distribution."
+                    f"entropy_dims is {entropy_dims}, but the actor is no tanh-Gaussian; leave "
+                    "entropy_dims out, or give the actor TanhNormal as its distribution."
                 )
         check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
         check_choice("loss_function", loss_function, ("l2", "l1", "smooth_l1"))
@@ -132,7 +132,7 @@ class LeanSACLoss(SACLoss):
             _check_support(support)
             support = support.detach().clone()
         self.register_buffer("support", support)
-        self.counted = counted
+        self.entropy_dims = entropy_dims
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """See :meth:`torchrl.objectives.common.LossModule.set_keys`.
@@ -169,7 +169,7 @@ class LeanSACLoss(SACLoss):
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            return drawn(self.actor_network.get_dist(observed), counted=self.counted)
+            return drawn(self.actor_network.get_dist(observed), entropy_dims=self.entropy_dims)
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """The critics' inputs, with the actor's ``action``."""
@@ -275,11 +275,11 @@ def _check_support(support: Tensor) -> None:
 
 
 def drawn(
-    distribution: Distribution, sample_shape: Sequence[int] = (), counted: int | None = None
+    distribution: Distribution, sample_shape: Sequence[int] = (), entropy_dims: int | None = None
 ) -> tuple[Tensor, Tensor]:
     """Reparametrized samples [S, *, n] with their log-probabilities [S, *].
 
-    For a tanh-Gaussian, only the first ``counted`` entries count in the log-probability.
+    For a tanh-Gaussian, only the first ``entropy_dims`` entries count in the log-probability.
 
     ``Normal.rsample`` is avoided: it fills an empty tensor in place, which ``torch.vmap`` refuses.
     """
@@ -291,7 +291,7 @@ def drawn(
     action = transform(preimage)
     slope = transform.log_abs_det_jacobian(preimage, action)
     each = distribution.base_dist.base_dist.log_prob(preimage) - slope
-    return action, each[..., :counted].sum(-1)
+    return action, each[..., :entropy_dims].sum(-1)
 
 
 def value_key(critic: TensorDictModule, name: NestedKey) -> NestedKey:

@@ -27,8 +27,9 @@ class SynergySACLoss(LeanSACLoss):
     Entropy is measured over the coefficients and the action given them: the decoder's
     :meth:`~torchrl_etl.modules.SynergyDecoder.log_slope` corrects for how far the action moves with
     the residual. Otherwise noise that the action's bounds suppress would count. If the residual's
-    noise has a fixed size, set ``counted``: only the coefficients' entropy counts then, without the
-    correction. The policy could change the rest only by keeping muscles off their bounds.
+    noise has a fixed size, set ``entropy_dims``: only the coefficients' entropy counts then,
+    without the correction. The policy could change the rest only by keeping muscles off their
+    bounds.
 
     Equation: section 4.2, a = Dec(z^a); SAC otherwise as in TorchRL, without a state-value network.
 
@@ -154,7 +155,7 @@ class SynergySACLoss(LeanSACLoss):
 
     def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         synergy, log_prob = super()._sample(tensordict)
-        if self.counted is not None or not hasattr(self.decoder_network, "log_slope"):
+        if self.entropy_dims is not None or not hasattr(self.decoder_network, "log_slope"):
             return synergy, log_prob
         params = self.decoder_network_params
         params = params if self.train_decoder else params.detach()
