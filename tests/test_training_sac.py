@@ -51,13 +51,13 @@ def test_update_moves_the_temperature_and_every_target_network(make):
     at = next(i for i, each in enumerate(learner.parameters) if each is log_alpha)
     inputs = learner.inputs(batch.unsqueeze(0))
     slope, temperature = learner.gradients(inputs[0])[0][at], log_alpha.item()
-    followers = [target for target in learner.targets if target.followers]
-    assert len(followers) == 1 + len([t for t in learner.objective.terms if t.target is not None])
-    before = [[each.clone() for each in target.followers] for target in followers]
+    updaters = [target for target in learner.targets if target.target_tensors]
+    assert len(updaters) == 1 + len([t for t in learner.objective.terms if t.target is not None])
+    before = [[each.clone() for each in target.target_tensors] for target in updaters]
     learner.updates(inputs)
     assert (log_alpha - temperature).sign() == -slope.sign() != 0
-    for target, starts in zip(followers, before, strict=True):
-        targets, sources = target.followers, target.followed
+    for target, starts in zip(updaters, before, strict=True):
+        targets, sources = target.target_tensors, target.source_tensors
         pairs = list(zip(starts, sources, strict=True))
         torch.testing.assert_close(targets, [start.lerp(source, 0.3) for start, source in pairs])
         assert any(not torch.equal(now, start) for now, start in zip(targets, starts, strict=True))

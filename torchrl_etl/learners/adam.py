@@ -65,7 +65,7 @@ class GradientAdam(Adam):
         steps = [self.state[each]["step"] for each in parameters if each in self.state]
         return int(torch.stack(steps).max()) if steps else 0
 
-    def over(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
+    def mapped(self, other: Callable[[Tensor], Tensor]) -> GradientAdam:
         """A fresh optimizer with the same settings for ``other(parameter)`` of each parameter."""
         groups = [
             {**each, "params": list(map(other, each["params"]))} for each in self.param_groups

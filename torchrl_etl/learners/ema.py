@@ -61,7 +61,7 @@ class WarmedUpEMA(AveragedModel):
         both = *self._parameters_of, *self._buffers_of
         return [tensor for each in both for tensor in each]
 
-    def over(self, other: Callable[[Tensor], Tensor]) -> WarmedUpEMA:
+    def mapped(self, other: Callable[[Tensor], Tensor]) -> WarmedUpEMA:
         """A copy for ``other(tensor)`` of each tensor; the two share one update counter."""
         twin = copy(self)  # shares the buffer ``n_averaged``
         twin._parameters_of = tuple(list(map(other, each)) for each in self._parameters_of)

@@ -256,7 +256,7 @@ class SACLearner:
         return self.optimizer.steps_of(self._stepped)
 
     @property
-    def pace(self) -> tuple[float, ...]:
+    def step_sizes(self) -> tuple[float, ...]:
         """Step sizes in effect: update count, learning rates, target-network and EMA rates."""
         targets = (target.eps for target in self.targets)
         return self.num_updates, *self.optimizer.rates, *targets, self.ema.decay
@@ -264,12 +264,12 @@ class SACLearner:
     @property
     def state(self) -> list[Tensor]:
         """Every tensor that an update modifies, without duplicates, except update counters."""
-        followers = [tensor for target in self.targets for tensor in target.followers]
-        found = *self.parameters, *followers, *self.ema.tensors, *self.optimizer.moments
+        updated = [tensor for target in self.targets for tensor in target.target_tensors]
+        found = *self.parameters, *updated, *self.ema.tensors, *self.optimizer.moments
         found += tuple(self.statistics.values())
         return list({id(tensor): tensor for tensor in found}.values())
 
-    def over(
+    def mapped(
         self, other: Callable[[Tensor], Tensor], gradients: Callable[[TensorDictBase], Gradients]
     ) -> SACLearner:
         """A copy that updates ``other(tensor)`` for each tensor, along these gradients."""
@@ -277,9 +277,9 @@ class SACLearner:
         twin.parameters = list(map(other, self.parameters))
         twin.unit_rows = list(map(other, self.unit_rows))
         twin.statistics = {name: other(each) for name, each in self.statistics.items()}
-        twin.optimizer = self.optimizer.over(other)
-        twin.targets = [target.over(other) for target in self.targets]
-        twin.ema = self.ema.over(other)
+        twin.optimizer = self.optimizer.mapped(other)
+        twin.targets = [target.mapped(other) for target in self.targets]
+        twin.ema = self.ema.mapped(other)
         twin._step_along(gradients)
         return twin
 

@@ -68,7 +68,7 @@ class SideBySide:
         self._stacks: dict[int, Tensor] = {}
         self._whole = whole(learners[0].objective)
         self._checked = not learners[0].objective.transforms
-        self._all = learners[0].over(self._stack, self.gradients)
+        self._all = learners[0].mapped(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
         """Run k updates of every learner on its own :meth:`SACLearner.inputs` [k]; returns the
@@ -145,10 +145,11 @@ class SideBySide:
 
     @torch.no_grad()
     def _take(self) -> None:
-        if len(paces := {learner.pace for learner in self.learners}) > 1:
+        if len(differing := {learner.step_sizes for learner in self.learners}) > 1:
             raise ValueError(
-                f"The learners' updates and rates differ ({'; '.join(map(str, sorted(paces)))}); "
-                "update side by side those that are equally far and have the same settings."
+                "The learners' updates and rates differ "
+                f"({'; '.join(map(str, sorted(differing)))}); update side by side those that are "
+                "equally far and have the same settings."
             )
         first = self.learners[0].optimizer
         torch._foreach_copy_(*self._rows_and_own())

@@ -35,15 +35,15 @@ class FusedSoftUpdate(SoftUpdate):
             (self._targets.get((f"target_{name}", *key)), source)
             for (name, *key), source in self._sources.items(True, True)
         )
-        self.followers, self.followed = map(list, zip(*pairs, strict=True))
+        self.target_tensors, self.source_tensors = map(list, zip(*pairs, strict=True))
 
     @torch.no_grad()
     def step(self) -> None:
-        torch._foreach_lerp_(self.followers, self.followed, 1 - self.eps)
+        torch._foreach_lerp_(self.target_tensors, self.source_tensors, 1 - self.eps)
 
-    def over(self, other: Callable[[Tensor], Tensor]) -> FusedSoftUpdate:
+    def mapped(self, other: Callable[[Tensor], Tensor]) -> FusedSoftUpdate:
         """The same update with each tensor replaced by ``other(tensor)``."""
         twin = copy(self)
-        twin.followers = list(map(other, self.followers))
-        twin.followed = list(map(other, self.followed))
+        twin.target_tensors = list(map(other, self.target_tensors))
+        twin.source_tensors = list(map(other, self.source_tensors))
         return twin
