@@ -93,7 +93,7 @@ def test_ema_after_warm_up_equals_pytorchs_and_copies_buffers():
     theirs = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(0.3))
     for step in range(9):
         torch.nn.init.normal_(model.weight), model.running_mean.fill_(step)
-        ours.follow()
+        ours.update()
         if step < 3:  # (1 + n) / (10 + n) passes 0.3 at n = 3
             theirs.load_state_dict(ours.state_dict())
         else:

@@ -50,7 +50,7 @@ def test_running_return_of_a_new_episode_starts_at_zero():
 
 def test_forget_drops_running_returns_and_keeps_the_scale():
     scale = seen(2.0)
-    scale.forget()
+    scale.reset_episodes()
     scale.update(torch.tensor([[20.0], [0.0]]), torch.zeros(2, 1, dtype=torch.bool))
     assert scale.scale == 10.0  # 20 / 2 and not (20 + 5.5 / 2) / 2
 

@@ -17,25 +17,27 @@ SEEN = torch.tensor([[1.0, -3.0, 7.0], [2.0, 5.0, 7.0], [6.0, 1.0, 7.0], [3.0, 9
 def test_output_is_standardized_by_all_values_seen(cuts):
     norm = RunningNorm(3)
     for part in SEEN.tensor_split(cuts):
-        norm.see(part)
+        norm.update_moments(part)
     expected = (SEEN - SEEN.mean(0)) / SEEN.std(0, correction=0)
     torch.testing.assert_close(norm(SEEN)[:, :2], expected[:, :2])
 
 
 def test_constant_entry_is_only_centered():
     norm = RunningNorm(3)
-    norm.see(SEEN)
+    norm.update_moments(SEEN)
     assert norm(torch.tensor([0.0, 0.0, 8.0]))[2] == 1.0
 
 
 def test_batches_of_any_shape_count_as_rows():
     norm, flat = RunningNorm(3), RunningNorm(3)
-    norm.see(SEEN.view(2, 2, 3))
-    flat.see(SEEN)
+    norm.update_moments(SEEN.view(2, 2, 3))
+    flat.update_moments(SEEN)
     torch.testing.assert_close(norm(SEEN.view(2, 2, 3)), flat(SEEN).view(2, 2, 3))
 
 
-@pytest.mark.parametrize("take", [RunningNorm(3).see, RunningDeviation(decay=0.9).update])
+@pytest.mark.parametrize(
+    "take", [RunningNorm(3).update_moments, RunningDeviation(decay=0.9).update]
+)
 def test_an_empty_batch_changes_nothing(take):
     take(SEEN)
     before = deepcopy(take.__self__.state_dict())
@@ -46,7 +48,7 @@ def test_an_empty_batch_changes_nothing(take):
 
 def test_integers_are_normalized_like_floats():
     norm = RunningNorm(3)
-    norm.see(SEEN.long() * 3 + 1)
+    norm.update_moments(SEEN.long() * 3 + 1)
     assert torch.equal(norm(SEEN.long()), norm(SEEN))
 
 
@@ -56,13 +58,13 @@ def test_output_is_unchanged_before_any_value_is_seen():
 
 def test_outliers_are_clipped():
     norm = RunningNorm(3, clip=2.0)
-    norm.see(SEEN)
+    norm.update_moments(SEEN)
     assert norm(SEEN + 1e6).max() == 2.0
 
 
 def test_statistics_change_only_in_see_and_survive_a_round_trip():
     norm, other = RunningNorm(3), RunningNorm(3)
-    norm.see(SEEN)
+    norm.update_moments(SEEN)
     before = norm(SEEN)
     norm.train()(SEEN * 100)
     other.load_state_dict(norm.state_dict())

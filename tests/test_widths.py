@@ -40,7 +40,11 @@ def fine_tune(action):
         (decode, torch.zeros(2, 1), r"'latent' has shape \[2, 1\]; it must end with \[4\]"),
         (fine_tune, torch.zeros(8, 1), r"action has shape \[8, 1\].* must be 16"),
         (GMVAELoss(GMVAE(12, 2)), torch.zeros(8, 1), r"action has shape \[8, 1\].* must be 12"),
-        (RunningNorm(3).see, torch.zeros(4, 6), r"values has shape \[4, 6\].* must be 3"),
+        (
+            RunningNorm(3).update_moments,
+            torch.zeros(4, 6),
+            r"values has shape \[4, 6\].* must be 3",
+        ),
     ],
 )
 def test_wrong_last_dimension_is_refused(use, given, words):

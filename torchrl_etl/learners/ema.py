@@ -33,7 +33,7 @@ class WarmedUpEMA(AveragedModel):
         >>> ema = WarmedUpEMA(model, decay=0.9)
         >>> for weight in (0.0, 11.0):
         ...     _ = torch.nn.init.constant_(model.weight, weight)
-        ...     ema.follow()
+        ...     ema.update()
         >>> ema.module.weight.item()  # the decay was 2 / 11
         9.0
     """
@@ -45,7 +45,7 @@ class WarmedUpEMA(AveragedModel):
         self._buffers_of = list(self.module.buffers()), list(model.buffers())
 
     @torch.no_grad()
-    def follow(self) -> None:
+    def update(self) -> None:
         """Update the average with the current weights."""
         n = int(self.n_averaged)
         decay = min(self.decay, (1 + n) / (10 + n)) if n else 0.0
@@ -57,7 +57,7 @@ class WarmedUpEMA(AveragedModel):
 
     @property
     def tensors(self) -> list[Tensor]:
-        """Every tensor that :meth:`follow` reads or modifies, except the update counter."""
+        """Every tensor that :meth:`update` reads or modifies, except the update counter."""
         both = *self._parameters_of, *self._buffers_of
         return [tensor for each in both for tensor in each]
 

@@ -175,7 +175,7 @@ class SACLearner:
         scalars = []
         for each in inputs.unbind(0):
             scalars.append(self._step(each))
-            self.ema.follow()  # reads its count in Python, so it is not part of a CUDA graph
+            self.ema.update()  # reads its count in Python, so it is not part of a CUDA graph
         return torch.stack(scalars)
 
     def inputs(self, batches: TensorDictBase) -> TensorDictBase:
@@ -235,12 +235,12 @@ class SACLearner:
             reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
             self.objective.return_scale.update(reward, done, episode_numbers(batch))
         if self.objective.normalizer is not None:
-            self.objective.normalizer.see(batch["observation"])
+            self.objective.normalizer.update_moments(batch["observation"])
 
     def restart(self, actions: int) -> None:
         """Prepare for new episodes in all simulators, after ``actions`` actions of each worker."""
         if self.objective.return_scale is not None:
-            self.objective.return_scale.forget()
+            self.objective.return_scale.reset_episodes()
         for tell in self.on_restart:
             tell(actions)
 

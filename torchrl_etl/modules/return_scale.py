@@ -43,9 +43,9 @@ class ReturnScale(RunningMoments):
         check_real("(0, inf)", bound=bound)
         self.gamma, self.bound = gamma, bound
         self.register_buffer("largest", torch.zeros((), dtype=torch.float64))
-        self.forget()
+        self.reset_episodes()
 
-    def forget(self) -> None:
+    def reset_episodes(self) -> None:
         """Start all episodes anew; the scale keeps its statistics."""
         self._sums: dict[int, float] = {}
 
@@ -70,7 +70,7 @@ class ReturnScale(RunningMoments):
         last = zip(episode[:, -1].tolist(), sums.tolist(), done[:, -1].tolist(), strict=True)
         self._sums |= {name: so_far for name, so_far, ends in last if not ends}
         values = torch.stack(seen)
-        self.see(values)
+        self.update_moments(values)
         self.largest.copy_(torch.maximum(self.largest, values.abs().max()))
 
     @property

@@ -21,7 +21,7 @@ class RunningMoments(nn.Module):
     Examples:
         >>> import torch
         >>> moments = RunningMoments()
-        >>> moments.see(torch.tensor([1.0, 3.0]))
+        >>> moments.update_moments(torch.tensor([1.0, 3.0]))
         >>> moments.mean.item(), moments.variance.item()
         (2.0, 1.0)
     """
@@ -33,7 +33,7 @@ class RunningMoments(nn.Module):
             self.register_buffer(name, torch.zeros(tuple(shape), dtype=torch.float64))
 
     @torch.no_grad()
-    def see(self, values: Tensor) -> None:
+    def update_moments(self, values: Tensor) -> None:
         """Update with values [*, *shape], possibly none."""
         if self.mean.ndim:
             check_width(self.mean.shape[-1], values=values)

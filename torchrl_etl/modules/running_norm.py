@@ -16,8 +16,8 @@ class RunningNorm(RunningMoments):
 
     Joint angles, small pose errors and muscle forces come in one observation; without normalization
     the largest dominate (SimBa, Lee 2024). The statistics are buffers, so they travel with a
-    policy's weights. Only :meth:`see` changes them: sampled batches and environment steps are
-    normalized by the same numbers.
+    policy's weights. Only :meth:`update_moments` changes them: sampled batches and environment
+    steps are normalized by the same numbers.
 
     Args:
         size (int): size of an observation.
@@ -32,7 +32,7 @@ class RunningNorm(RunningMoments):
         >>> import torch
         >>> from torchrl_etl.modules import RunningNorm
         >>> norm = RunningNorm(1)
-        >>> norm.see(torch.tensor([[1.0], [3.0]]))
+        >>> norm.update_moments(torch.tensor([[1.0], [3.0]]))
         >>> norm(torch.tensor([4.0]))  # mean 2, deviation 1
         tensor([2.])
     """

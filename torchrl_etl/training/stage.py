@@ -227,7 +227,7 @@ class Stage:
         if self.multi_step is not None:
             rows["steps_to_next_obs"] = torch.ones(rows.shape, dtype=torch.long, device=rows.device)
         if self.learner.objective.normalizer is not None:
-            self.learner.objective.normalizer.see(rows["observation"])
+            self.learner.objective.normalizer.update_moments(rows["observation"])
         self.buffer.extend(rows.select(*self._kept))
         self.earn(len(rows))
 
