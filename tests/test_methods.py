@@ -199,7 +199,7 @@ def test_resume_of_an_older_run_corrects_a_setting_its_method_ignores(tmp_path):
 def test_method_file_holds_the_fixed_settings_of_its_method(method):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         made = compose("config", overrides=[f"method={method}"])
-    for key, value, _ in CLASSES[made.method.kind].fixed:
+    for key, value, _ in CLASSES[made.method.kind].fixed_settings:
         assert OmegaConf.select(made, key) == value
 
 
@@ -354,9 +354,9 @@ def test_dynsyn_paper_preset_has_the_published_amplitude(tmp_path):
 
 
 def test_leg_and_hand_options_are_chosen_by_the_body(tmp_path):
-    of_the_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.of_the_body
-    assert of_the_body({"legs": 1.0, "hands": 0.66}) == 1.0
-    assert of_the_body(0.5) == 0.5
+    resolve_for_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.resolve_for_body
+    assert resolve_for_body({"legs": 1.0, "hands": 0.66}) == 1.0
+    assert resolve_for_body(0.5) == 0.5
     assert Experiment(rival("sar", tmp_path / "run")).method.blend == 0.66
     one_number = rival("dynsyn", tmp_path / "run", "method.options.amplitude=5")
     assert Experiment(one_number).method.amplitude == 5

@@ -70,7 +70,7 @@ class Experiment:
         self.folder = RunFolder(path, self.config, unique=unique)
         self.context = Context(self.config, self.folder, say)
         if resume is not None:  # older runs may hold settings that their method overrode
-            for key, value, _ in method.fixed:
+            for key, value, _ in method.fixed_settings:
                 OmegaConf.update(self.config, key, value)
         self.method = method(self.context)
         self.method.check()
@@ -140,7 +140,7 @@ class Experiment:
         )
 
     def _learn(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
-        stage, charged = self.method.stage(), self.method.charged
+        stage, charged = self.method.stage(), self.method.charged_frames
         self.method.begin(stage)
         evaluator = self.evaluator(stage)
         last = yield from self.context.run_stage(
@@ -182,10 +182,10 @@ class Experiment:
 
     def _divide_frames(self) -> None:
         """Give the learning stage the frames that its preparation leaves."""
-        left = self.config.frames - self.method.charged
+        left = self.config.frames - self.method.charged_frames
         if left < 1:
             raise ValueError(
-                f"frames is {self.config.frames}, of which {self.method.charged} go into what "
-                "comes before learning; give more in all, or less to that."
+                f"frames is {self.config.frames}, of which {self.method.charged_frames} go into "
+                "what comes before learning; give more in all, or less to that."
             )
         self.config.learn.frames = left

@@ -39,18 +39,18 @@ class DynSyn(Method):
     weights deviate after that share of the stage's frames, linearly up to ``ceiling`` at the last.
     """
 
-    fixed = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
+    fixed_settings = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
     takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         deviation = dict(self.options)
-        self.charged = deviation.pop("frames")
-        self.amplitude = self.of_the_body(deviation.pop("amplitude"))
-        self.share = self.of_the_body(deviation.pop("group_share"))
+        self.charged_frames = deviation.pop("frames")
+        self.amplitude = self.resolve_for_body(deviation.pop("amplitude"))
+        self.share = self.resolve_for_body(deviation.pop("group_share"))
         self.deviation = deviation
         with naming("method.options"):
-            check_integer(1, frames=self.charged)
+            check_integer(1, frames=self.charged_frames)
             check_real("(0, inf)", amplitude=self.amplitude)
             check_real("(0, 1]", group_share=self.share)
             if "start_share" in deviation:
@@ -67,7 +67,7 @@ class DynSyn(Method):
         seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
         lengths = record_muscle_lengths(
             self.context.make_env(action_repeat=1),  # one recorded step is one frame
-            self.charged,
+            self.charged_frames,
             amplitude=self.amplitude,
             seed=2**30 + seed,
             on_step=stop.check,

@@ -25,7 +25,7 @@ class EME(Method):
     :class:`~torchrl_etl.baselines.EMEBonus`.
     """
 
-    fixed = (("learn.n_steps", 1, "bonus and metric are of single steps"),)
+    fixed_settings = (("learn.n_steps", 1, "bonus and metric are of single steps"),)
     takes = ("embedding_dim", "hidden", "ensemble", "lr", "tau", "weight", "normalize", "max_scale")
 
     def stage(self) -> Stage:

@@ -73,7 +73,7 @@ class ETL(Method):
         super().__init__(context)
         config = context.config
         self.given = config.synergies.bundle is not None
-        self.charged = 0 if self.given else config.explore.frames
+        self.charged_frames = 0 if self.given else config.explore.frames
         if config.stage == "learn" and not self.given:
             raise ValueError(
                 "stage=learn needs synergies=PATH, the run folder or bundle of an earlier "
@@ -98,7 +98,7 @@ class ETL(Method):
         given, own = config.synergies.bundle, self.context.folder.synergies
         # Store the absolute path in the run's configuration.
         absolute = given if given == BODY else str(zoo.bundle_path(given).resolve())
-        self.explores_nothing(bundle=absolute)
+        self.record_no_exploration(bundle=absolute)
         config.stage = "learn"
         if given == BODY and not surviving_folder(own).exists():
             with closing(self.context.make_env(seed=0)) as env:
@@ -171,7 +171,7 @@ class ETL(Method):
             yield from self._explore(stop)
         _, info = self._load()
         if not self.given:  # whole batches may exceed the budget by a few frames
-            self.charged = info.facts["frames"]
+            self.charged_frames = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
 
     def _explore(self, stop: StopOnSignal) -> Work[None]:

@@ -26,19 +26,19 @@ class Method(ABC):
         context (Context): configuration, folder and environment of the run.
 
     Attributes:
-        charged (int): frames that :meth:`prepare` uses; they count toward the budget.
+        charged_frames (int): frames that :meth:`prepare` uses; they count toward the budget.
         has_synergies (bool): whether ``stage`` and ``synergies`` may be set.
         takes (tuple of str): names of the method's own options.
-        fixed (tuple): settings with only one valid value, each as (key, value, reason).
+        fixed_settings (tuple): settings with only one valid value, each as (key, value, reason).
 
     Raises:
         ValueError: for an unknown or invalid option, and for settings that the method ignores.
     """
 
-    charged: int = 0
+    charged_frames: int = 0
     has_synergies: ClassVar[bool] = False
     takes: ClassVar[tuple[str, ...]] = ()
-    fixed: ClassVar[tuple[tuple[str, Any, str], ...]] = ()
+    fixed_settings: ClassVar[tuple[tuple[str, Any, str], ...]] = ()
     options: Mapping[str, Any]
 
     def __init__(self, context: Context) -> None:
@@ -57,7 +57,7 @@ class Method(ABC):
                 f"method={config.method.name} has one stage and no synergies; leave stage and "
                 "synergies out."
             )
-        for key, value, reason in self.fixed:
+        for key, value, reason in self.fixed_settings:
             section, _, name = key.rpartition(".")
             if (given := context.options(section)[name]) != value:
                 raise ValueError(
@@ -65,9 +65,9 @@ class Method(ABC):
                     f"use {key}={value}."
                 )
         if not self.has_synergies:
-            self.explores_nothing()
+            self.record_no_exploration()
 
-    def explores_nothing(self, bundle: str | None = None) -> None:
+    def record_no_exploration(self, bundle: str | None = None) -> None:
         """Record in the run's configuration that it has no stage 1."""
         config = self.context.config
         config.exploration = {"kind": None}
@@ -98,7 +98,7 @@ class Method(ABC):
 
     def frames_before(self) -> int:
         """Frames that :meth:`prepare` has used, or will use if it has not run."""
-        return self.charged
+        return self.charged_frames
 
     def decoder(self) -> SynergyMap | None:
         """The decoder at the start of learning, if it is known already."""
@@ -112,7 +112,7 @@ class Method(ABC):
         """Build every part once, so that invalid arguments raise before the first frame."""
         self.stage()
 
-    def of_the_body(self, option: float | Mapping[str, float]) -> float:
+    def resolve_for_body(self, option: float | Mapping[str, float]) -> float:
         """Resolve an option that may have separate values for ``legs`` and ``hands``.
 
         Bodies with a floating root count as legs.

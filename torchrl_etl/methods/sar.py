@@ -58,9 +58,9 @@ class SAR(Method):
             check_integer(1, **{name: self.options[name] for name in whole})
             check_integer(0, preview_episodes=self.options["preview_episodes"])
             check_real("[0, 100]", percentile=self.options["percentile"])
-        self.charged = self.options["frames"] + self.rollout_frames
+        self.charged_frames = self.options["frames"] + self.rollout_frames
         self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
-        self.blend = self.of_the_body(self.options["blend"])
+        self.blend = self.resolve_for_body(self.options["blend"])
         self.play_spec = context.spec
         if self.task is not None:
             env = make_env(self.task, action_repeat=config.action_repeat)
@@ -135,7 +135,7 @@ class SAR(Method):
             actions,
             task=self.played,
             actuators=spec.actuators,
-            facts={"vaf": vaf, "frames": self.charged, "seed": seed, **facts()},
+            facts={"vaf": vaf, "frames": self.charged_frames, "seed": seed, **facts()},
         )
 
     def decoder(self) -> SARDecoder | None:
