@@ -45,9 +45,9 @@ def build_learner(
     inputs: Mapping[str, int] | None = None,
     make_actor: Callable[..., Actor] = make_actor,
     make_behavior: Callable[[Actor], TensorDictModuleBase] | None = None,
-    wrap: Callable[[TensorDictModuleBase], TensorDictModuleBase] = lambda behavior: behavior,
+    wrap_behavior: Callable[[TensorDictModuleBase], TensorDictModuleBase] = lambda policy: policy,
     entropy: Callable[[Bounded, float | None], float] = entropy_target,
-    more: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
+    extra_options: Callable[[Actor], Mapping[str, Any]] = lambda actor: {},
 ) -> SACLearner:
     """Build networks for an environment and the learner that owns them.
 
@@ -72,9 +72,9 @@ def build_learner(
         make_actor (callable): builds the actor. Default: :func:`~torchrl_etl.modules.make_actor`.
         make_behavior (callable, optional): builds the behavior policy from the actor; ``noise`` is
             then ignored.
-        wrap (callable): wraps the behavior policy, noise included.
+        wrap_behavior (callable): wraps the behavior policy, noise included.
         entropy (callable): maps the spec of actor outputs and ``action_std`` to a target entropy.
-        more (callable): maps the actor to additional arguments of the learner.
+        extra_options (callable): maps the actor to additional arguments of the learner.
 
     Raises:
         ValueError: if an argument is invalid; the message names it.
@@ -93,7 +93,7 @@ def build_learner(
     with naming("critic"):
         value = make_critic({**inputs, "action": action_spec.shape[-1]}, **critic).to(device)
     explore = make_behavior or partial(with_noise, **noise)
-    behavior, options = wrap(explore(policy)), dict(more(policy))
+    behavior, options = wrap_behavior(explore(policy)), dict(extra_options(policy))
     if init_random_actions:
         warmup = UniformWarmup(emitted, init_random_actions, action_key=out_key)
         behavior = TensorDictSequential(behavior, warmup)

@@ -35,8 +35,8 @@ class DEP(Method):
             controller = DEPExploration(self.context.spec.action_spec, **self.options)
         controller.dep_frames = self.context.actions(self.options["dep_frames"])
         learner = self.context.learner(
-            wrap=lambda behavior: TensorDictSequential(behavior, controller),
-            more=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
+            wrap_behavior=lambda behavior: TensorDictSequential(behavior, controller),
+            extra_options=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
         )
         return self.context.stage(learner, env_options={"muscle_lengths": True})
 

@@ -110,6 +110,6 @@ class DynSyn(Method):
             make_actor=make_actor,
             make_behavior=lambda actor: actor,
             entropy=entropy,
-            more=lambda actor: {"on_frames": [partial(set_frames, actor)]},
+            extra_options=lambda actor: {"on_frames": [partial(set_frames, actor)]},
         )
         return self.context.stage(learner)

@@ -38,11 +38,11 @@ class EME(Method):
             scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
             bonus = EMEBonus(encoder.to(device), ensemble.to(device), **scale)
 
-        def more(actor):
+        def extra_options(actor):
             gamma = self.context.config.learn.sac.gamma
             loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
             with naming("method.options", in_full=True):
                 term = Term(loss, lr=options["lr"], tau=options["tau"])
             return {"terms": [term], "transforms": [bonus], "reward": "total_reward"}
 
-        return self.context.stage(self.context.learner(more=more))
+        return self.context.stage(self.context.learner(extra_options=extra_options))

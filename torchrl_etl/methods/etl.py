@@ -279,7 +279,7 @@ class ETL(Method):
             decoder=decoder,
             make_actor=partial(make_actor, **self._quiet),
             entropy=lambda emitted, std: entropy_target(emitted[:entropy_dims], std),
-            more=lambda actor: {
+            extra_options=lambda actor: {
                 "train_decoder": mode == "critic",
                 "terms": [term],
                 "entropy_dims": entropy_dims,

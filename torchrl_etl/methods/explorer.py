@@ -59,7 +59,7 @@ class Explorer:
         with naming("exploration"):
             terms = list(self.exploration.terms())
 
-        def more(actor):
+        def extra_options(actor):
             with naming("fit"):
                 self.shown = ShownActions(actor, **fit)
             self.term = None
@@ -73,7 +73,10 @@ class Explorer:
             }
 
         learner = context.learner(
-            "explore", inputs=self.exploration.inputs, wrap=self.exploration.behavior, more=more
+            "explore",
+            inputs=self.exploration.inputs,
+            wrap_behavior=self.exploration.behavior,
+            extra_options=extra_options,
         )
         self.fitter = learner.only(*([] if self.term is None else [self.term]))
         env_options = {"activations": True} if fit["actions"] == "activation" else {}

@@ -160,7 +160,7 @@ class SAR(Method):
         self.context.seed_everything("learn")
         learner = self.context.learner(
             decoder=decoder.to(self.context.device),
-            more=lambda actor: {"terms": [Term(DecoderLoss(decoder), weight=0.0)]},
+            extra_options=lambda actor: {"terms": [Term(DecoderLoss(decoder), weight=0.0)]},
         )
         return self.context.stage(learner, keep=("synergy",))
 
