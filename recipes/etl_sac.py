@@ -39,7 +39,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.in_processes import in_processes
 from torchrl_etl.layout import choose_layout
 from torchrl_etl.training import Interrupted, resumed_config, together
-from torchrl_etl.training.config import of_each_seed, to_go_on
+from torchrl_etl.training.config import resume_setting, split_seeds
 from torchrl_etl.training.loop import StopOnSignal
 
 CONF = Path(__file__).parent / "conf"
@@ -83,7 +83,7 @@ def main(config: DictConfig) -> None:
             raise failure
     stopped = [folder for folder, end in ends if isinstance(end, Interrupted)]
     if stopped:
-        command = shlex.join(["python", sys.argv[0], to_go_on(stopped)])
+        command = shlex.join(["python", sys.argv[0], resume_setting(stopped)])
         with suppress(OSError):  # the terminal may be gone
             print(f"Stopped and saved. To go on: {command}", flush=True)
     if failures or stopped:
@@ -104,7 +104,7 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
         return
     # By default, runs that begin in the same second have the same name.
     named = any(override.lstrip("+").startswith("run_dir=") for override in given)
-    for own in of_each_seed(settled(config)):
+    for own in split_seeds(settled(config)):
         say = print if config.seeds is None else partial(print, f"seed {own.seed}:")
         yield {"config": own, "resume": None, "unique": not named, "say": say}
 

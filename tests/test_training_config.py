@@ -19,7 +19,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
-from torchrl_etl.training.config import RENAMED, of_each_seed, quoted, to_go_on
+from torchrl_etl.training.config import RENAMED, quoted, resume_setting, split_seeds
 from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.training.run_folder import RunFolder
 
@@ -309,7 +309,7 @@ def test_former_presets_paths_and_kinds_compose():
 def test_each_of_several_seeds_has_the_folder_of_a_single_run():
     config = tiny("seeds=[3,5]", "env=overactuated")
     config.run_dir, config.progress = "runs/a-${seed}", True
-    configs = of_each_seed(config)
+    configs = split_seeds(config)
     assert [(own.seed, own.run_dir, own.progress) for own in configs] == [
         (3, "runs/a-3", True),
         (5, "runs/a-5", False),
@@ -320,14 +320,14 @@ def test_each_of_several_seeds_has_the_folder_of_a_single_run():
 
 
 def test_seeds_of_one_run_dir_get_subfolders():
-    configs = of_each_seed(tiny("seeds=[3,5]", "run_dir=runs/a"))
+    configs = split_seeds(tiny("seeds=[3,5]", "run_dir=runs/a"))
     assert [own.run_dir for own in configs] == ["runs/a/seed3", "runs/a/seed5"]
 
 
 @pytest.mark.parametrize("seeds", ["[]", "[0,0]", "[0,1.5]", "[true,2]", "3", "text"])
 def test_invalid_seeds_are_refused(seeds):
     with pytest.raises(ValueError, match=r"seeds is .*; it must be a list of different whole"):
-        of_each_seed(tiny(f"seeds={seeds}", "run_dir=runs/a"))
+        split_seeds(tiny(f"seeds={seeds}", "run_dir=runs/a"))
 
 
 FOLDERS = ("runs/a", "my runs/b", "läufe/c", "it's/d", "a,b/e", "1", "null", "g/\\", "h/\\'")
@@ -336,5 +336,5 @@ FOLDERS = ("runs/a", "my runs/b", "läufe/c", "it's/d", "a,b/e", "1", "null", "g
 def test_quoted_folder_names_survive_hydra():
     for folder in FOLDERS:
         assert parse_override(f"run_dir={quoted(folder)}").value() == folder
-    found = parse_override(to_go_on([Path(folder) for folder in FOLDERS])).value()
+    found = parse_override(resume_setting([Path(folder) for folder in FOLDERS])).value()
     assert [str(each) for each in found] == list(FOLDERS)

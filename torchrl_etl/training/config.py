@@ -34,9 +34,9 @@ __all__ = [
     "RENAMED",
     "bfloat16_warning",
     "check_device",
-    "of_each_seed",
     "quoted",
-    "to_go_on",
+    "resume_setting",
+    "split_seeds",
     "validate",
 ]
 
@@ -152,7 +152,7 @@ def _check_values(config: DictConfig) -> None:
     check_real("(0, inf)", **of("collector.timeout"))
 
 
-def of_each_seed(config: DictConfig) -> list[DictConfig]:
+def split_seeds(config: DictConfig) -> list[DictConfig]:
     """One configuration per entry of ``seeds``; the given configuration if ``seeds`` is null.
 
     Each run has the folder that it would have alone, or a subfolder ``seedN`` if ``run_dir`` does
@@ -195,14 +195,14 @@ def quoted(value: str) -> str:
     return "'" + re.sub(r"(\\+)$", r"\1\1", value) + "'"
 
 
-def to_go_on(folders: Sequence[Path]) -> str:
+def resume_setting(folders: Sequence[Path]) -> str:
     """The ``resume=`` setting that resumes the runs in these folders.
 
     Hydra needs quotation marks around names with special characters. For a single folder, recipes
     add them (:func:`~torchrl_etl.command_line.quote_paths`).
 
     Examples:
-        >>> to_go_on([Path("runs/a"), Path("my runs/b")])
+        >>> resume_setting([Path("runs/a"), Path("my runs/b")])
         "resume=[runs/a,'my runs/b']"
     """
     names = [str(folder) for folder in folders]

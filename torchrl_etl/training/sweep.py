@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from torchrl_etl.analysis.sweep_results import COLUMNS, RESULTS
 from torchrl_etl.io import write_atomically
-from torchrl_etl.training.config import to_go_on
+from torchrl_etl.training.config import resume_setting
 from torchrl_etl.training.run_folder import RunFolder
 
 __all__ = ["Run", "Sweep", "end_with_parent"]
@@ -161,7 +161,7 @@ def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
     first, *others = runs
     script, *settings = first.command
     if first.has_begun:
-        where, settings = to_go_on([run.path for run in runs]), []
+        where, settings = resume_setting([run.path for run in runs]), []
     elif others:
         where = f"run_dir={first.stem}${{seed}}"
         settings = [*first.settings, f"seeds=[{','.join(str(run.seed) for run in runs)}]"]
