@@ -40,8 +40,8 @@ def test_synergies_are_fitted_to_actions_for_relabeled_directions():
     relabelled = redraw(rows.clone())
     torch.manual_seed(0)
     seen = found.actions()
-    torch.testing.assert_close(seen, found.shown(relabelled)["action"])
-    assert not torch.allclose(seen, found.shown(rows)["action"])
+    torch.testing.assert_close(seen, found.selector(relabelled)["action"])
+    assert not torch.allclose(seen, found.selector(rows)["action"])
     found.stage.close()
 
 

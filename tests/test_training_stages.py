@@ -220,7 +220,7 @@ def test_best_share_keeps_the_highest_rewards():
     stage = found.stage
     fill(stage)
     batch = stage.sample()
-    best = found.shown(batch)["action"]
+    best = found.selector(batch)["action"]
     reward = batch["next", "reward"].squeeze(-1)
     threshold = reward.sort(descending=True).values[7]
     assert best.shape[0] == 8

@@ -7,7 +7,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchrl_etl.analysis.arrays import as_array, as_matrix
-from torchrl_etl.synergies.factors import make_nmf, principal_components, unfinished
+from torchrl_etl.synergies.factors import (
+    ignore_convergence_warnings,
+    make_nmf,
+    principal_components,
+)
 
 __all__ = ["nmf_vaf", "pca_vaf", "variance_accounted_for"]
 
@@ -123,7 +127,7 @@ def nmf_vaf(
         )
     shifted = shifted.clip(min=0.0) / (shifted.max() or 1.0)
     model = make_nmf(num_synergies)
-    with unfinished():
+    with ignore_convergence_warnings():
         weights = model.fit_transform(shifted)
     return variance_accounted_for(shifted, weights @ model.components_)
 

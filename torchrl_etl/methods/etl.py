@@ -129,7 +129,7 @@ class ETL(Method):
     def check(self) -> None:
         if not self.given:
             explorer = Explorer(self.context)
-            if explorer.shown.actions == "activation":
+            if explorer.selector.actions == "activation":
                 self.context.make_env(activations=True).close()
             self._try_out(explorer.model)
         self.stage()

@@ -14,7 +14,7 @@ from torchrl_etl.exploration import EXPLORATIONS, Exploration
 from torchrl_etl.learners import Term
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.own_code import find_class
-from torchrl_etl.synergies import SYNERGY_MODELS, ShownActions, SynergyModel
+from torchrl_etl.synergies import SYNERGY_MODELS, ActionSelector, SynergyModel
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.work import Work
 
@@ -61,10 +61,10 @@ class Explorer:
 
         def extra_options(actor):
             with naming("fit"):
-                self.shown = ShownActions(actor, **fit)
+                self.selector = ActionSelector(actor, **fit)
             self.term = None
             if self.model.loss is not None:
-                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.shown)
+                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.selector)
                 terms.append(self.term)
             return {
                 "terms": terms,
@@ -87,7 +87,7 @@ class Explorer:
             env_transforms=self.exploration.reset_transforms(),
             transforms=self.relabel,
             **self._updates(),
-            keep=(*self.exploration.keep, *self.shown.keep),
+            keep=(*self.exploration.keep, *self.selector.keep),
         )
         self.seed = self.stage.seed
 
@@ -121,7 +121,7 @@ class Explorer:
         rows = self.stage.newest(count).to(self.stage.device)
         for transform in self.relabel:
             rows = transform(rows)
-        return self.shown(self.fitter.objective.prepare(rows))["action"]
+        return self.selector(self.fitter.objective.prepare(rows))["action"]
 
     def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
         """All transitions of stage 1 for the buffer of stage 2, with the unscaled task reward and

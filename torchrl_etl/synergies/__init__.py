@@ -1,5 +1,6 @@
 """Models that extract synergies from muscle actions, one per file."""
 
+from torchrl_etl.synergies.action_selector import ActionSelector
 from torchrl_etl.synergies.affine import AffineSynergies
 from torchrl_etl.synergies.bundle import copy_bundle, load_bundle, save_bundle
 from torchrl_etl.synergies.bundle_info import BundleError, BundleInfo, check_compatible
@@ -10,11 +11,11 @@ from torchrl_etl.synergies.nmf import NMFSynergies
 from torchrl_etl.synergies.pca import PCASynergies
 from torchrl_etl.synergies.recordings import Recording, read_recording
 from torchrl_etl.synergies.sar import SARSynergies
-from torchrl_etl.synergies.shown import ShownActions
 from torchrl_etl.synergies.vae import VAESynergies
 
 __all__ = [
     "SYNERGY_MODELS",
+    "ActionSelector",
     "AffineSynergies",
     "BundleError",
     "BundleInfo",
@@ -23,7 +24,6 @@ __all__ = [
     "PCASynergies",
     "Recording",
     "SARSynergies",
-    "ShownActions",
     "SynergyModel",
     "VAESynergies",
     "check_compatible",

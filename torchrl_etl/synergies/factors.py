@@ -18,7 +18,7 @@ from torchrl_etl.extras import extra
 if TYPE_CHECKING:
     from sklearn.decomposition import NMF, PCA
 
-__all__ = ["make_nmf", "principal_components", "unfinished"]
+__all__ = ["ignore_convergence_warnings", "make_nmf", "principal_components"]
 
 
 def principal_components(rows: np.ndarray, count: int, **options: Any) -> PCA:
@@ -40,7 +40,7 @@ def make_nmf(count: int, max_iter: int = 500) -> NMF:
 
 
 @contextmanager
-def unfinished() -> Iterator[None]:
+def ignore_convergence_warnings() -> Iterator[None]:
     """Silence convergence warnings: more iterations would not change a synergy noticeably."""
     from sklearn.exceptions import ConvergenceWarning
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrl_etl.checks import check_integer
 from torchrl_etl.synergies.affine import AffineSynergies
-from torchrl_etl.synergies.factors import make_nmf, unfinished
+from torchrl_etl.synergies.factors import ignore_convergence_warnings, make_nmf
 
 __all__ = ["NMFSynergies"]
 
@@ -53,13 +53,13 @@ class NMFSynergies(AffineSynergies):
         # The factorization fails on all zeros, as when no muscle is ever active.
         above[0] += 1e-9 * (not above.any())
         self._unit = above.max()
-        with unfinished():
+        with ignore_convergence_warnings():
             self.model.fit(above / self._unit)
         return self._unit * self.model.components_
 
     def coefficients(self, actions: Tensor) -> Tensor:
         rows = actions.detach().reshape(-1, len(self.low)).cpu().double().numpy()
-        with unfinished():
+        with ignore_convergence_warnings():
             found = torch.as_tensor(self.model.transform(self._above_low(rows) / self._unit))
         return found.to(self.low).reshape(*actions.shape[:-1], self.num_synergies)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrl_etl.checks import check_integer
 from torchrl_etl.synergies.affine import AffineSynergies
-from torchrl_etl.synergies.factors import principal_components, unfinished
+from torchrl_etl.synergies.factors import ignore_convergence_warnings, principal_components
 
 __all__ = ["SARSynergies", "independent_components"]
 
@@ -79,7 +79,7 @@ def independent_components(
         from sklearn.decomposition import FastICA
 
         ica = FastICA(whiten="unit-variance", max_iter=max_iter, random_state=seed)
-        with unfinished():  # any rotation is as good among Gaussian components
+        with ignore_convergence_warnings():  # any rotation is as good among Gaussian components
             ica.fit(pca.transform(actions)[:, :varying])
         mean = mean + ica.mean_ @ basis[:varying]
         basis[:varying] = ica.mixing_.T @ basis[:varying]

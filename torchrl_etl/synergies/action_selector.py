@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchrl_etl.checks import check_choice, check_real
 
-__all__ = ["ShownActions"]
+__all__ = ["ActionSelector"]
 
 Actions = Literal["policy", "mean", "sampled", "activation"]
 
 
-class ShownActions:
+class ActionSelector:
     """Selects from a batch of transitions the actions on which a synergy model is trained.
 
     Deviates: Algorithm 1 has "collected action data". Actions sampled from a maximum-entropy policy
