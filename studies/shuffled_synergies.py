@@ -38,7 +38,7 @@ def main() -> None:
     with torch.no_grad():
         last.weight.copy_(last.weight[places])
         last.bias.copy_(last.bias[places])
-    decoder.carry(None)  # its encoder expects the original order of muscles
+    decoder.set_encoder(None)  # its encoder expects the original order of muscles
     save_bundle(
         decoder,
         arguments.out / "synergies",

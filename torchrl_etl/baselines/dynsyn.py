@@ -16,7 +16,7 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl_etl.checks import check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers, start_small
-from torchrl_etl.objectives.sac import drawn
+from torchrl_etl.objectives.sac import rsample_and_log_prob
 
 __all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
 
@@ -129,13 +129,13 @@ class GroupedTanhNormal(D.Distribution):
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
         """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too."""
-        shared, log_prob = drawn(self.group_normal, sample_shape)
+        shared, log_prob = rsample_and_log_prob(self.group_normal, sample_shape)
         noise = standard_normal(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
         action = self._spread(shared, self.weight_loc + self.weight_scale * noise)
         return action, log_prob - self._log_half
 
     def log_prob(self, value: Tensor) -> Tensor:
-        unit = picked((value - self.center) / self.half, self.first)
+        unit = gather_last((value - self.center) / self.half, self.first)
         return self.group_normal.log_prob(unit) - self._log_half
 
     @property
@@ -146,22 +146,22 @@ class GroupedTanhNormal(D.Distribution):
     @property
     def _log_half(self) -> Tensor:
         """Log half width of the first members' bounds, summed over groups [*]."""
-        return picked(self.half.log(), self.first).sum(-1)
+        return gather_last(self.half.log(), self.first).sum(-1)
 
     def _spread(self, shared: Tensor, weight: Tensor) -> Tensor:
         """Actions [*, n] from the groups' actions in ±1 [*, k] and v [*, n - k]."""
         change = (_DEVIATION * weight.tanh()).clamp(-self.amplitude, self.amplitude)
         change = torch.cat([change.new_zeros(*change.shape[:-1], 1), change], -1)
-        change = picked(change, self.slot)
-        weighted = picked(shared, self.group) * (1 + change)
+        change = gather_last(change, self.slot)
+        weighted = gather_last(shared, self.group) * (1 + change)
         return (self.center + self.half * weighted).clamp(self.low, self.high)
 
 
-def picked(values: Tensor, index: Tensor) -> Tensor:
+def gather_last(values: Tensor, index: Tensor) -> Tensor:
     """Gather entries [*, k] of values [*, n] by an index [*, k]; batch sizes may broadcast.
 
     Examples:
-        >>> picked(torch.tensor([[5, 6], [7, 8]]), torch.tensor([1, 1, 0]))
+        >>> gather_last(torch.tensor([[5, 6], [7, 8]]), torch.tensor([1, 1, 0]))
         tensor([[6, 6, 5],
                 [8, 8, 7]])
     """

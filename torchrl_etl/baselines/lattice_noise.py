@@ -93,8 +93,8 @@ class LatticeNoise(TensorDictModuleBase):
         network = self.actor[0].module
         features = network.features(*(tensordict.get(key) for key in self.actor[0].in_keys))
         if exploration_type() in (None, ExplorationType.RANDOM):
-            begins = tensordict.get(self.init_key, None)
-            latent, direct = self._drawn(features, begins)
+            is_init = tensordict.get(self.init_key, None)
+            latent, direct = self._drawn(features, is_init)
             noisy = features + network.spread.alpha * _times(features, latent)
             value = network.mean(noisy) + _times(features, direct)
         else:
@@ -109,7 +109,7 @@ class LatticeNoise(TensorDictModuleBase):
         return distribution.deterministic_sample
 
     @torch.no_grad()
-    def _drawn(self, features: Tensor, begins: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _drawn(self, features: Tensor, is_init: Tensor | None) -> tuple[Tensor, Tensor]:
         """P_x [*, H, H] and P_a [*, H, n] of this step."""
         rows = features.shape[:-1]
         scales = self.actor[0].module.spread.scales()
@@ -117,8 +117,8 @@ class LatticeNoise(TensorDictModuleBase):
             self._matrices = tuple(scale.new_zeros(*rows, *scale.shape) for scale in scales)
             self._age = torch.full(rows, self.freq, device=features.device)
         fresh = self._age >= self.freq
-        if begins is not None:
-            fresh = fresh | begins.squeeze(-1)
+        if is_init is not None:
+            fresh = fresh | is_init.squeeze(-1)
         # Draws only what is used: matrices for all rows at every step would cost more than a
         # small simulator's step.
         count = int(fresh.sum())

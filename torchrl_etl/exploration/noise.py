@@ -81,8 +81,8 @@ class LastingNoise(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        begins = tensordict.get("is_init").squeeze(-1)
-        noise = self.draw(self.low.expand(*begins.shape, -1), begins)
+        is_init = tensordict.get("is_init").squeeze(-1)
+        noise = self.draw(self.low.expand(*is_init.shape, -1), is_init)
         unit = (self.std * noise).tanh()
         action = self.low + (unit + 1) / 2 * (self.high - self.low)
         return tensordict.set("action", action)

@@ -58,7 +58,7 @@ class _ResidualBlock(nn.Sequential):
             return hidden + super().forward(hidden)
 
 
-class _QuietTail(nn.Module):
+class _FixedStdTail(nn.Module):
     """Fixes the standard deviation of a Gaussian's last ``count`` entries."""
 
     def __init__(self, count: int, std: float) -> None:
@@ -148,7 +148,7 @@ def make_actor(
     start_small(layers)
     layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
     if quiet:
-        layers.append(_QuietTail(quiet, quiet_std))
+        layers.append(_FixedStdTail(quiet, quiet_std))
     return actor_with(TanhNormal, layers, inputs, ["loc", "scale"], action_spec, out_key)
 
 

@@ -75,13 +75,13 @@ class HeldNoise(TensorDictModuleBase):
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return self.actor(tensordict)
         distribution = self.actor.get_dist(tensordict)
-        begins = tensordict.get(self.init_key, None)
-        if begins is None:
+        is_init = tensordict.get(self.init_key, None)
+        if is_init is None:
             raise KeyError(
                 f"HeldNoise reads {self.init_key!r}, which the data lacks; give the environment an "
                 "InitTracker()."
             )
-        noise = self._draw(distribution.loc, begins.squeeze(-1))
+        noise = self._draw(distribution.loc, is_init.squeeze(-1))
         action = distribution.loc + distribution.scale * noise
         for transform in distribution.transforms:
             action = transform(action)

@@ -29,7 +29,7 @@ class HeldNormal:
 
     Examples:
         >>> held = HeldNormal(longest=16)
-        >>> held(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
+        >>> held(torch.zeros(4, 2), is_init=torch.ones(4, dtype=torch.bool)).shape
         torch.Size([4, 2])
     """
 
@@ -40,16 +40,16 @@ class HeldNormal:
         self._noise: Tensor | None = None
         self._left: Tensor | None = None
 
-    def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
-        """Noise [*, n] of this step in the dtype of ``like``; ``begins`` [*] marks where an episode
-        begins."""
+    def __call__(self, like: Tensor, is_init: Tensor) -> Tensor:
+        """Noise [*, n] of this step in the dtype of ``like``; ``is_init`` [*] marks where an
+        episode begins."""
         if self._noise is None or self._noise.shape != like.shape:
             self._noise = torch.zeros_like(like)
-            self._left = torch.zeros_like(begins, dtype=torch.long)
-        lengths = 1 + torch.multinomial(self._chances, begins.numel(), replacement=True)
-        fresh = begins | (self._left == 0)
+            self._left = torch.zeros_like(is_init, dtype=torch.long)
+        lengths = 1 + torch.multinomial(self._chances, is_init.numel(), replacement=True)
+        fresh = is_init | (self._left == 0)
         drawn = torch.randn_like(like)
-        self._left = torch.where(fresh, lengths.to(begins.device).view_as(begins), self._left) - 1
+        self._left = torch.where(fresh, lengths.to(is_init.device).view_as(is_init), self._left) - 1
         self._noise = torch.where(fresh.unsqueeze(-1), drawn, self._noise)
         return self._noise
 
@@ -72,7 +72,7 @@ class PinkNormal:
 
     Examples:
         >>> pink = PinkNormal(longest=64)
-        >>> pink(torch.zeros(4, 2), begins=torch.ones(4, dtype=torch.bool)).shape
+        >>> pink(torch.zeros(4, 2), is_init=torch.ones(4, dtype=torch.bool)).shape
         torch.Size([4, 2])
     """
 
@@ -82,12 +82,12 @@ class PinkNormal:
         self._kept = torch.exp(-1 / constants)
         self._parts: Tensor | None = None
 
-    def __call__(self, like: Tensor, begins: Tensor) -> Tensor:
+    def __call__(self, like: Tensor, is_init: Tensor) -> Tensor:
         """Noise of this step, see :class:`HeldNormal`."""
         kept = self._kept.to(like).view(-1, *[1] * like.ndim)
         drawn = torch.randn((len(kept), *like.shape), dtype=like.dtype, device=like.device)
         if self._parts is None or self._parts.shape != drawn.shape:
             self._parts = drawn
         going_on = kept * self._parts + (1 - kept.square()).sqrt() * drawn
-        self._parts = torch.where(begins.unsqueeze(-1), drawn, going_on)
+        self._parts = torch.where(is_init.unsqueeze(-1), drawn, going_on)
         return self._parts.sum(0) / math.sqrt(len(kept))

@@ -95,7 +95,7 @@ class SynergyDecoder(SynergyMap):
     Attributes:
         encoder (GMVAE, optional): frozen copy of the model that the decoder was made from, used by
             :meth:`encode`. It is not a submodule, so it is neither trained nor in the state dict.
-            With another decoder's weights, also call ``carry(other.encoder)``.
+            With another decoder's weights, also call ``set_encoder(other.encoder)``.
 
     Raises:
         ValueError: if a size is not positive or ρ is outside [0, 1].
@@ -136,9 +136,9 @@ class SynergyDecoder(SynergyMap):
             out_keys=[out_keys] if isinstance(out_keys, str) else list(out_keys),
         )
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
-        self.carry(None)
+        self.set_encoder(None)
 
-    def carry(self, encoder: GMVAE | None) -> None:
+    def set_encoder(self, encoder: GMVAE | None) -> None:
         """Encode with a frozen copy of this model from now on."""
         if encoder is not None:
             encoder = deepcopy(encoder).requires_grad_(False)
@@ -195,7 +195,7 @@ class SynergyDecoder(SynergyMap):
                 )
             scaled.center.copy_(center)
             scaled.scale.copy_(scale.clamp_min(1e-6))
-        decoder.carry(gmvae)
+        decoder.set_encoder(gmvae)
         return decoder
 
     @classmethod

@@ -169,7 +169,9 @@ class LeanSACLoss(SACLoss):
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            return drawn(self.actor_network.get_dist(observed), entropy_dims=self.entropy_dims)
+            return rsample_and_log_prob(
+                self.actor_network.get_dist(observed), entropy_dims=self.entropy_dims
+            )
 
     def _at(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """The critics' inputs, with the actor's ``action``."""
@@ -274,7 +276,7 @@ def _check_support(support: Tensor) -> None:
         )
 
 
-def drawn(
+def rsample_and_log_prob(
     distribution: Distribution, sample_shape: Sequence[int] = (), entropy_dims: int | None = None
 ) -> tuple[Tensor, Tensor]:
     """Reparametrized samples [S, *, n] with their log-probabilities [S, *].

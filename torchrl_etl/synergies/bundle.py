@@ -192,7 +192,7 @@ def load_bundle(
         raise BundleError(
             f"The config and the tensors in {str(folder)!r} do not make a SynergyDecoder: {error}"
         ) from error
-    decoder.carry(encoder)
+    decoder.set_encoder(encoder)
     bounds = tuple(decoder.low.tolist()), tuple(decoder.high.tolist())
     sizes = decoder.num_synergies, decoder.action_dim
     if bounds != (info.low, info.high) or sizes != (info.num_synergies, len(info.actuators)):
