@@ -85,7 +85,7 @@ class EMEBonus(TransitionReward):
     ensemble: TensorDictModuleBase
     """The networks given at construction, not copies."""
 
-    _cure = "name the right one in in_keys."
+    _remedy = "name the right one in in_keys."
 
     def __init__(
         self,

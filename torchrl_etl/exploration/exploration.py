@@ -30,13 +30,14 @@ class Exploration:
         reward (NestedKey): the reward that SAC maximizes in stage 1, below ``"next"``.
         keep (sequence of NestedKey): entries of a transition that the buffer must also keep.
         inputs (mapping): sizes of actor and critic inputs besides the observation, by key.
-        learns (bool): whether a policy is trained; if not, updates train only the synergy model.
+        trains_policy (bool): whether a policy is trained; if not, updates train only the synergy
+            model.
     """
 
     reward: NestedKey = "reward"
     keep: Sequence[NestedKey] = ()
     inputs: Mapping[str, int]
-    learns: ClassVar[bool] = True
+    trains_policy: ClassVar[bool] = True
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self.inputs = {}

@@ -30,7 +30,7 @@ class NoiseExploration(Exploration):
         exponent (float): exponent of the hold lengths, for held noise.
     """
 
-    learns = False
+    trains_policy = False
 
     def __init__(
         self, spec: EnvironmentSpec, *, color: Color, std: float, longest: int, exponent: float

@@ -45,7 +45,7 @@ class Explorer:
         self.final_updates = fit.pop("final_updates")
         context.seed_everything("explore")
         self.exploration = make_exploration(context)
-        if not self.exploration.learns and fit["actions"] in ("policy", "mean"):
+        if not self.exploration.trains_policy and fit["actions"] in ("policy", "mean"):
             raise ValueError(
                 f"explore.fit.actions is {fit['actions']!r}, but with exploration="
                 f"{context.config.exploration.kind} no policy learns whose actions could be shown; "
@@ -93,7 +93,7 @@ class Explorer:
 
     def _updates(self) -> dict[str, Any]:
         """Stage arguments that replace or defer updates if the exploration does not learn."""
-        if self.exploration.learns:
+        if self.exploration.trains_policy:
             return {}
         if self.term is None:  # the model is fitted once, on all actions
             return {"learning_starts": sys.maxsize}

@@ -102,7 +102,7 @@ class IntrinsicReward(ScaledBonus):
     encoder: TensorDictModuleBase
     """The encoder given at construction, not a copy."""
 
-    _cure = (
+    _remedy = (
         "put the transform that writes it (DirectionPrimer for the direction) before "
         "IntrinsicReward."
     )
@@ -130,7 +130,7 @@ class IntrinsicReward(ScaledBonus):
         return (self.encoder,)
 
     @property
-    def _carried(self) -> Sequence[NestedKey]:
+    def _state_keys(self) -> Sequence[NestedKey]:
         return self.in_keys[1:]
 
     @property

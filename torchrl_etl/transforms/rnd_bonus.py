@@ -58,7 +58,7 @@ class RNDBonus(ScaledBonus):
         True
     """
 
-    _cure = "name the right one in in_key."
+    _remedy = "name the right one in in_key."
 
     def __init__(
         self,

@@ -29,7 +29,7 @@ class TransitionReward(SoleWriter):
     with the dtype of ``_typed_by``.
     """
 
-    _cure: str
+    _remedy: str
     """Remedy in the error about an observation that an environment lacks."""
 
     @property
@@ -38,7 +38,7 @@ class TransitionReward(SoleWriter):
         return ()
 
     @property
-    def _carried(self) -> Sequence[NestedKey]:
+    def _state_keys(self) -> Sequence[NestedKey]:
         """In-keys, besides the first, that the env's state spec must contain."""
         return ()
 
@@ -113,7 +113,7 @@ class TransitionReward(SoleWriter):
         if state_spec is None:
             state_spec = Composite(shape=self.parent.batch_size, device=self.parent.device)
         set_leaf(state_spec, self._copy_key, self._leaf(self.in_keys[0]).clone(), self.parent)
-        for key in self._carried:
+        for key in self._state_keys:
             if key not in state_spec.keys(True, True):
                 set_leaf(state_spec, key, self._leaf(key).clone(), self.parent)
         return state_spec
@@ -134,7 +134,7 @@ class TransitionReward(SoleWriter):
         observed = sorted(map(str, self.parent.full_observation_spec.keys(True, True)))
         raise KeyError(
             f"{type(self).__name__} reads {key!r}, but the env's observations are {observed}; "
-            f"{self._cure}"
+            f"{self._remedy}"
         )
 
 
