@@ -27,8 +27,8 @@ from torchrl_etl.checks import check_choice, check_flag, check_integer
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
 from torchrl_etl.layout import available_cores
-from torchrl_etl.own_conf import group_files
 from torchrl_etl.training import Run, Sweep, validate
+from torchrl_etl.user_conf import group_files
 
 HERE = Path(__file__).parent
 CONF = HERE / "conf"

@@ -32,7 +32,6 @@ from torchrl_etl.checks import check_choice, check_flag, check_integer, check_re
 from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH
-from torchrl_etl.own_conf import group_files
 from torchrl_etl.synergies import (
     Recording,
     SynergyModel,
@@ -40,6 +39,7 @@ from torchrl_etl.synergies import (
     read_recording,
     save_bundle,
 )
+from torchrl_etl.user_conf import group_files
 
 CONF = Path(__file__).parent / "conf"
 HEADER = ("synergies", "fitted", "held out", "worst fold", "best fold")

@@ -25,7 +25,7 @@ from torchrl_etl.command_line import (
     quiet_torchrl,
     quote_paths,
 )
-from torchrl_etl.opened import open_bundle, open_run, open_zoo
+from torchrl_etl.inspection import open_bundle, open_run, open_zoo
 from torchrl_etl.zoo import bundle_path
 
 CONF = Path(__file__).parent / "conf"

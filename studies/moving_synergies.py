@@ -25,7 +25,7 @@ draw_without_display()
 from torchrl_etl.analysis.moving_pictures import FPS, write_moving_pictures
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.command_line import one_sentence
-from torchrl_etl.opened import open_bundle
+from torchrl_etl.inspection import open_bundle
 from torchrl_etl.training import EpisodeRecorder
 
 SHOWN = 3

@@ -12,8 +12,8 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_etl.command_line import translate
-from torchrl_etl.own_conf import group_files
 from torchrl_etl.training.resumed import parse_override
+from torchrl_etl.user_conf import group_files
 
 ROOT = Path(__file__).parent.parent
 CONF = ROOT / "recipes" / "conf"

@@ -23,7 +23,7 @@ from torchrl_etl.command_line import translate
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.export import command_of, describe_policy, export_run, rebuilt
-from torchrl_etl.opened import open_zoo
+from torchrl_etl.inspection import open_zoo
 from torchrl_etl.synergies import check_compatible, load_bundle
 from torchrl_etl.training import Evaluation, evaluate_task, resumed_config, validate
 from torchrl_etl.zoo import ZooError

@@ -19,9 +19,9 @@ import gymnasium
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
-from torchrl_etl.own_conf import group_files
 from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED, quoted
 from torchrl_etl.training.resumed import check_prefix, parse_override
+from torchrl_etl.user_conf import group_files
 
 with extra("recipes"):
     from hydra import compose, initialize_config_dir

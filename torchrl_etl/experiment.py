@@ -18,7 +18,6 @@ from torchrl_etl.collectors import start_resource_tracker
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.extras import extra
 from torchrl_etl.methods import METHODS, Method
-from torchrl_etl.own_code import find_class
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.config import bfloat16_warning, validate
 from torchrl_etl.training.context import Context
@@ -27,6 +26,7 @@ from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder, facts
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.work import Work, alone
+from torchrl_etl.user_code import find_class
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -15,10 +15,10 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.extras import extra
 from torchrl_etl.io import surviving_folder
 from torchrl_etl.learners import SACLearner
-from torchrl_etl.own_conf import group_files
 from torchrl_etl.training import evaluate_task, resumed_config
 from torchrl_etl.training.config import quoted
 from torchrl_etl.training.resumed import parse_override
+from torchrl_etl.user_conf import group_files
 from torchrl_etl.zoo import Card, describe_decoder, make_policy, save_entry
 
 with extra("recipes"):

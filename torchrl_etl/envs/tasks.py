@@ -15,7 +15,7 @@ import gymnasium as gym
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs.myosuite import register_myosuite
 from torchrl_etl.envs.quiet import dm_control_suite, quiet_compiler
-from torchrl_etl.own_code import import_own
+from torchrl_etl.user_code import import_user_module
 
 __all__ = ["Task", "episode_length", "list_tasks", "resolve_task"]
 
@@ -246,7 +246,7 @@ def _registered(name: str) -> bool:
     module, _, env_id = name.rpartition(":")
     if module:
         # Gymnasium 1 loads no plugins, so nothing else runs a user's gymnasium.register.
-        import_own(module, f"the task {name!r}; a task of your own is 'module:id'")
+        import_user_module(module, f"the task {name!r}; a task of your own is 'module:id'")
         if env_id not in gym.registry:
             raise ValueError(
                 f"Importing {module!r} registers no task {env_id!r}; register it in that module "

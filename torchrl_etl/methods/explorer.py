@@ -13,10 +13,10 @@ from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
 from torchrl_etl.learners import Term
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies import SYNERGY_MODELS, ActionSelector, SynergyModel
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.work import Work
+from torchrl_etl.user_code import find_class
 
 __all__ = ["Explorer", "make_exploration", "make_synergy_model"]
 

@@ -9,13 +9,13 @@ import numpy as np
 from torch import Tensor
 
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
-from torchrl_etl.own_code import find_class
 from torchrl_etl.synergies.gmvae import GMVAESynergies
 from torchrl_etl.synergies.model import SynergyModel
 from torchrl_etl.synergies.nmf import NMFSynergies
 from torchrl_etl.synergies.pca import PCASynergies
 from torchrl_etl.synergies.sar import SARSynergies
 from torchrl_etl.synergies.vae import VAESynergies
+from torchrl_etl.user_code import find_class
 
 __all__ = ["SYNERGY_MODELS", "fit_synergies"]
 

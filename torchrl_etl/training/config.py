@@ -22,7 +22,7 @@ from torchrl_etl.checks import (
 from torchrl_etl.collectors import COLLECTORS
 from torchrl_etl.envs import resolve_task
 from torchrl_etl.extras import extra
-from torchrl_etl.own_code import find_class
+from torchrl_etl.user_code import find_class
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -19,7 +19,7 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.extras import extra
 from torchrl_etl.io import as_json, read_json, write_atomically
-from torchrl_etl.own_code import find_class
+from torchrl_etl.user_code import find_class
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -18,9 +18,9 @@ from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.io import own_folder, read_bytes, replace_folder
 from torchrl_etl.modules import SynergyMap
-from torchrl_etl.own_code import check_imported
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.synergies.bundle_info import some
+from torchrl_etl.user_code import check_imported
 from torchrl_etl.zoo.card import CARD, WEIGHTS, Card, ZooError
 from torchrl_etl.zoo.policy import make_policy
 

@@ -14,11 +14,11 @@ from torchrl_etl.analysis.viewer import Subject
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyMap
-from torchrl_etl.own_code import check_imported
 from torchrl_etl.synergies import BundleError, check_compatible, load_bundle
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.evaluation import EVALUATION_SEED, longest_episode
 from torchrl_etl.training.resumed import resumed_config
+from torchrl_etl.user_code import check_imported
 
 __all__ = ["open_bundle", "open_run", "open_zoo"]
 
@@ -111,7 +111,7 @@ def open_zoo(name: str, env: str | None = None) -> Subject:
         BundleError: if its synergies are damaged, see :func:`open_bundle`.
 
     Examples:
-        >>> from torchrl_etl.opened import open_zoo
+        >>> from torchrl_etl.inspection import open_zoo
         >>> open_zoo("overactuated").drivers[0]
         'policy'
     """

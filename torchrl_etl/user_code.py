@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from torchrl_etl.checks import check_choice
 
-__all__ = ["check_imported", "find_class", "import_own"]
+__all__ = ["check_imported", "find_class", "import_user_module"]
 
 T = TypeVar("T")
 
@@ -61,7 +61,7 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
         check_choice("kind", kind, list(kinds))
         return kinds[kind]
     module, _, name = kind.rpartition(":")
-    own = import_own(module, f"{kind!r}; a kind of your own is 'module:Class'")
+    own = import_user_module(module, f"{kind!r}; a kind of your own is 'module:Class'")
     found = getattr(own, name, None)
     if not isinstance(found, type) or not issubclass(found, base):
         raise ValueError(
@@ -71,7 +71,7 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
     return found
 
 
-def import_own(module: str, usage: str) -> ModuleType:
+def import_user_module(module: str, usage: str) -> ModuleType:
     """Import a module that is installed or in the current folder.
 
     The current folder is added at the end of ``sys.path``, since scripts in other folders lack it.

@@ -22,8 +22,8 @@ from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.analysis.viewer.page import Page, check_port
 from torchrl_etl.envs import SimulationError, actuator_names
 from torchrl_etl.experiment import Experiment
+from torchrl_etl.inspection import open_bundle, open_run, open_zoo
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.opened import open_bundle, open_run, open_zoo
 from torchrl_etl.synergies import BundleError, save_bundle
 from torchrl_etl.zoo import ZooError, read_card
 
@@ -156,7 +156,7 @@ def test_a_bundle_of_a_recording_is_shown_on_the_task_that_is_named(tmp_path):
 @pytest.mark.parametrize("fault", [SimulationError, gymnasium.error.DependencyNotInstalled])
 @pytest.mark.parametrize(
     ("recipe", "opening"),
-    [("view.py", "torchrl_etl.opened.open_zoo"), ("evaluate.py", "torchrl_etl.zoo.load")],
+    [("view.py", "torchrl_etl.inspection.open_zoo"), ("evaluate.py", "torchrl_etl.zoo.load")],
 )
 def test_simulator_error_is_printed_in_one_line(recipe, opening, fault, monkeypatch, capsys):
     def fail(*arguments, **options):
