@@ -93,9 +93,9 @@ def test_next_requested_batch_uses_the_newest_decoder(start, policy):
 def test_batch_uses_the_weights_of_its_request(start, policy):
     batches = start("process")
     batches.restart(seed=0)
-    batches.ask()
+    batches.request()
     decodes_to(policy, 0.5)
-    batches.ask()  # a second request does nothing
+    batches.request()  # a second request does nothing
     assert batches.next()["action"].std() > 0
     assert batches.next()["action"].allclose(torch.tensor(0.5))
 

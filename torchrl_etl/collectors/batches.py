@@ -112,15 +112,15 @@ class Batches:
             if self._caller is None:  # set_seed has already reset workers
                 self._collector.reset()
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Request the next batch from the workers, if there are any and none is pending."""
         if self._caller is not None and self._next is None:
-            self._next = self._ask()
+            self._next = self._request()
 
     def next(self) -> TensorDictBase:
         """The next batch, with the collector's batch size."""
-        batch = self._wait("give a batch", self._next or self._ask())
-        self._next = self._ask() if self._ahead else None
+        batch = self._wait("give a batch", self._next or self._request())
+        self._next = self._request() if self._ahead else None
         return batch
 
     def close(self) -> None:
@@ -145,7 +145,7 @@ class Batches:
         if self._caller is not None:
             self._caller.stop()
 
-    def _ask(self) -> Future[TensorDictBase]:
+    def _request(self) -> Future[TensorDictBase]:
         self.await_start()
         if self._caller is not None:
             self._do("take new weights", self._collector.update_policy_weights_)

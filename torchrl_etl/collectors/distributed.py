@@ -27,7 +27,7 @@ from torchrl_etl.collectors.remote import (
     seeded_env,
     worker_seed,
 )
-from torchrl_etl.collectors.worker_process import live_as_long_as_the_learner
+from torchrl_etl.collectors.worker_process import exit_with_learner
 
 __all__ = ["DistributedWorkers"]
 
@@ -152,10 +152,10 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
 
     # Batches ---------------------------------------------------------------------------------
 
-    def _ask(self, worker: int) -> None:
+    def _request(self, worker: int) -> None:
         rank = worker + 1
         try:
-            if self._news(worker):
+            if self._needs_weights(worker):
                 # The worker is idle, so weights never change within a batch.
                 self._weight_sync_schemes["policy"].send(self._weights, worker_ids=worker)
             # TorchRL 0.14.1 leaves setting "busy" to the worker. Until it does, the "done" of its
@@ -168,14 +168,14 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         except RuntimeError as error:
             raise self._lost(worker, f"did not take weights ({error})") from error
 
-    def _take(self) -> tuple[int, TensorDictBase]:
+    def _receive(self) -> tuple[int, TensorDictBase]:
         worker = self._wait()
         try:
             for tracker in self._trackers.pop(worker):
                 tracker.wait()
         except RuntimeError as error:
             raise self._lost(worker, f"was lost while it sent a batch ({error})") from error
-        return worker, self._signed(self._tensordict_out[worker].clone(), worker)
+        return worker, self._with_origin(self._tensordict_out[worker].clone(), worker)
 
     def _wait(self) -> int:
         """The worker whose request is oldest among those that have a batch."""
@@ -228,7 +228,7 @@ _main = generic._distributed_init_collection_node
 
 def _seeded_main(seed: int, **kwargs: Any) -> None:
     """TorchRL's main function of a worker, with a seeded environment."""
-    live_as_long_as_the_learner()
+    exit_with_learner()
     kwargs["env_make"] = seeded_env(kwargs["env_make"], worker_seed(seed, kwargs["rank"] - 1))
     _main(**kwargs)
 

@@ -14,7 +14,7 @@ from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 
 from torchrl_etl.collectors.vector import VectorCollector
-from torchrl_etl.collectors.worker_process import live_as_long_as_the_learner, stop_signals_blocked
+from torchrl_etl.collectors.worker_process import exit_with_learner, stop_signals_blocked
 
 __all__ = ["AsyncProcessWorkers", "ProcessWorkers"]
 
@@ -40,7 +40,7 @@ class _OwnWeights:
             super().__init__(
                 [create_env_fn] * num_workers,
                 deepcopy(policy).cpu(),
-                init_fn=live_as_long_as_the_learner,
+                init_fn=exit_with_learner,
                 num_threads=torch.get_num_threads(),  # TorchRL would subtract one per worker
                 **kwargs,
             )

@@ -185,18 +185,18 @@ class RayWorkers(RemoteWorkers, RayCollector):
 
     # Batches ---------------------------------------------------------------------------------
 
-    def _ask(self, worker: int) -> None:
+    def _request(self, worker: int) -> None:
         import ray
 
         actor, push = self._remote_collectors[worker], None
-        if self._news(worker):
+        if self._needs_weights(worker):
             # One copy in the object store serves all workers.
             if getattr(self, "_stored", (None,))[0] is not self._weights:
                 self._stored = self._weights, ray.put(self._weights)
             push = actor.update_policy_weights_.remote(self._stored[1])
         self._pending[actor.next.remote()] = worker, push, time.monotonic()
 
-    def _take(self) -> tuple[int, TensorDictBase]:
+    def _receive(self) -> tuple[int, TensorDictBase]:
         import ray
 
         while True:
@@ -216,7 +216,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
             except ray.exceptions.RayError as error:  # the actor, its node or the object is gone
                 self._replace(worker, f"was lost ({type(error).__name__})", error)
                 continue
-            return worker, self._signed(batch, worker)
+            return worker, self._with_origin(batch, worker)
 
     def _replace_the_late(self) -> None:
         import ray
@@ -235,7 +235,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         if lost >= self.replacements:
             raise self._lost(worker, f"{cause}; {lost} were replaced before it") from error
         self._remote_collectors[worker] = self._start(worker)
-        self._ask(worker)
+        self._request(worker)
 
     def shutdown(self, timeout: float | None = None, shutdown_ray: bool = False) -> None:
         """Stop the workers, and Ray if it was started for them. Idempotent."""

@@ -82,37 +82,37 @@ class RemoteWorkers:
         self._weights = weights_of(policy)
 
     @abstractmethod
-    def _ask(self, worker: int) -> None:
+    def _request(self, worker: int) -> None:
         """Send the worker :attr:`_weights` if it lacks them, and request a batch."""
 
     @abstractmethod
-    def _take(self) -> tuple[int, TensorDictBase]:
+    def _receive(self) -> tuple[int, TensorDictBase]:
         """The next batch of any worker with a pending request, within the timeout."""
 
     def iterator(self) -> Iterator[TensorDictBase]:
         workers = range(self.num_workers)
         if not self._sync:
             for worker in workers:
-                self._ask(worker)
+                self._request(worker)
         while self.collected_frames < self.total_frames and not self._stopped:
             if self._sync:
                 for worker in workers:
-                    self._ask(worker)
-                batches = dict(self._take() for _ in workers)
+                    self._request(worker)
+                batches = dict(self._receive() for _ in workers)
                 batch = torch.stack([batches[worker] for worker in workers])
             else:
-                worker, batch = self._take()
-                self._ask(worker)
+                worker, batch = self._receive()
+                self._request(worker)
             self.collected_frames += batch.numel()
             yield batch
 
-    def _signed(self, batch: TensorDictBase, worker: int) -> TensorDictBase:
+    def _with_origin(self, batch: TensorDictBase, worker: int) -> TensorDictBase:
         """The batch with its origin. Call it before the worker's next request."""
         batch["collector", "worker"] = torch.full(batch.shape, worker)
         batch["collector", "policy_version"] = torch.full(batch.shape, self._known[worker])
         return batch
 
-    def _news(self, worker: int) -> bool:
+    def _needs_weights(self, worker: int) -> bool:
         """Whether the worker lacks the newest weights. Marks them as sent."""
         news = self._known.get(worker) != self.policy_version
         self._known[worker] = self.policy_version

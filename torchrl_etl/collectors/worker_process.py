@@ -13,7 +13,7 @@ from multiprocessing.connection import wait
 
 __all__ = [
     "STOP_SIGNALS",
-    "live_as_long_as_the_learner",
+    "exit_with_learner",
     "start_resource_tracker",
     "stop_signals_blocked",
 ]
@@ -22,7 +22,7 @@ __all__ = [
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
-def live_as_long_as_the_learner() -> None:
+def exit_with_learner() -> None:
     """Call it in a worker: ignore stop signals, and exit when the learner's process has ended.
 
     Terminals and batch systems signal every process of a run. The learner needs its workers until

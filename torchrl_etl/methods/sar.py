@@ -182,7 +182,7 @@ def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[Tenso
         stage.restart_collection()
         while stage.action_repeat * sum(map(len, rows)) < frames:
             check()
-            stage.ask()
+            stage.request()
             yield
             batch = stage.batches.next().to(stage.device)
             rows.append(batch.select(*kept).set("episode", episode_numbers(batch)).reshape(-1))

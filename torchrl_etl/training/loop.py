@@ -121,7 +121,7 @@ def run_stage(
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames
-            stage.ask()
+            stage.request()
             yield  # other seeds request their batches before this one waits
             report.batch(stage.collect(), (yield from stage.learn()))
             while stage.behind and not stop.requested:

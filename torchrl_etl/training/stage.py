@@ -155,9 +155,9 @@ class Stage:
     def finished(self) -> bool:
         return self.frames >= self.budget
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Let workers start on the next batch with the current policy."""
-        self.batches.ask()
+        self.batches.request()
 
     def collect(self) -> TensorDictBase:
         """Collect one batch into the buffer; returns the batch, flattened."""
