@@ -26,10 +26,10 @@ from omegaconf import DictConfig, ListConfig
 
 from torchrl_etl.collectors import CollectionError
 from torchrl_etl.command_line import (
-    OPENING_FAULTS,
+    OPENING_ERRORS,
     check_overrides,
+    exit_on_error,
     interval_in_words,
-    one_sentence,
     quiet_torchrl,
     quote_paths,
     translate,
@@ -55,7 +55,7 @@ SYNERGIES = (
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(*OPENING_FAULTS, CollectionError):
+    with exit_on_error(*OPENING_ERRORS, CollectionError):
         runs = list(asked_for(config, list(HydraConfig.get().overrides.task)))
         apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
         if len(runs) > 1 and not apart and runs[0]["config"].collector.kind == "distributed":
@@ -79,7 +79,7 @@ def main(config: DictConfig) -> None:
             print(report(end, folder))
     failures = [end for _, end in ends if isinstance(end, Exception)]
     for failure in failures:
-        with suppress(SystemExit), one_sentence(OSError, SimulationError, CollectionError):
+        with suppress(SystemExit), exit_on_error(OSError, SimulationError, CollectionError):
             raise failure
     stopped = [folder for folder, end in ends if isinstance(end, Interrupted)]
     if stopped:
@@ -138,7 +138,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
 
 
 if __name__ == "__main__":
-    with one_sentence(ValueError):
+    with exit_on_error(ValueError):
         sys.argv[1:] = translate(sys.argv[1:], CONF)
     sys.argv[1:] = quote_paths(sys.argv[1:], "run_dir", "resume", "synergies.bundle")
     check_overrides(CONF / "config.yaml", sys.argv[1:], __doc__)

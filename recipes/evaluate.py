@@ -29,9 +29,9 @@ from torchrl_etl import zoo
 from torchrl_etl.analysis.moving_pictures import write_moving_pictures
 from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.command_line import (
-    OPENING_FAULTS,
+    OPENING_ERRORS,
     check_overrides,
-    one_sentence,
+    exit_on_error,
     print_intervals,
     quiet_torchrl,
     quote_paths,
@@ -54,7 +54,7 @@ CONF = Path(__file__).parent / "conf"
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(*OPENING_FAULTS):
+    with exit_on_error(*OPENING_ERRORS):
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)
@@ -85,12 +85,12 @@ def main(config: DictConfig) -> None:
     if trained.card is not None:
         print(f"  {beside(trained.card, evaluation)}")
     path = trained.folder / "evaluation.json"
-    with one_sentence(OSError):  # now that the numbers are told
+    with exit_on_error(OSError):  # now that the numbers are told
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, as_json(result))
     print(f"  written to {path}")
     if recorder is not None:
-        with one_sentence(OSError, SimulationError), recorder:
+        with exit_on_error(OSError, SimulationError), recorder:
             videos = draw_episodes(config, trained, recorder)
         print("  videos  " + ", ".join(str(video) for video in videos))
 
@@ -133,7 +133,7 @@ def of_the_zoo(config: DictConfig) -> Trained:
 
 def open_recorder(config: DictConfig, env: EnvBase, size: tuple[int, int]) -> EpisodeRecorder:
     """Called before the evaluation, so that missing requirements are reported at once."""
-    with one_sentence(RuntimeError):
+    with exit_on_error(RuntimeError):
         return EpisodeRecorder(
             env, size=size, camera=config.video_camera, seconds=config.video_seconds
         )

@@ -19,9 +19,9 @@ from omegaconf import DictConfig
 
 from torchrl_etl.checks import check_choice, check_integer
 from torchrl_etl.command_line import (
-    OPENING_FAULTS,
+    OPENING_ERRORS,
     check_overrides,
-    one_sentence,
+    exit_on_error,
     print_intervals,
     quiet_torchrl,
     quote_paths,
@@ -38,7 +38,7 @@ CONF = Path(__file__).parent / "conf"
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     compose = partial(hydra.compose, "config")
-    with one_sentence(*OPENING_FAULTS):
+    with exit_on_error(*OPENING_ERRORS):
         if config.run is None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         check_choice("part", config.part, ("all", "synergies"))

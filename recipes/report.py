@@ -18,14 +18,14 @@ from pathlib import Path
 
 from torchrl_etl.analysis.sweep_report import write_report
 from torchrl_etl.analysis.sweep_results import read_sweep
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 
 DEFAULTS = {"results": "", "out": "", "frames": "", "control": "sac", "repetitions": "2000"}
 
 
 def main(arguments: Sequence[str]) -> None:
     settings = _settings(arguments)
-    with one_sentence(ValueError, OSError, ImportError):
+    with exit_on_error(ValueError, OSError, ImportError):
         frames = _count("frames", settings["frames"]) if settings["frames"] else None
         repetitions = _count("repetitions", settings["repetitions"])
         if not settings["results"]:

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from torchrl_etl.checks import check_choice, check_flag, check_integer
 from torchrl_etl.collectors import STOP_SIGNALS
-from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths, translate
+from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths, translate
 from torchrl_etl.layout import available_cores
 from torchrl_etl.training import Run, Sweep, validate
 from torchrl_etl.user_conf import group_files
@@ -47,7 +47,7 @@ SAID_BY = {
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="sweep")
 def main(config: DictConfig) -> None:
-    with one_sentence(ValueError, OSError, RuntimeError, ImportError, HydraException):
+    with exit_on_error(ValueError, OSError, RuntimeError, ImportError, HydraException):
         runs = queue(config)
         jobs = config.jobs or (1 if config.seeds_at_once else available_cores())
         options = {"attempts": config.attempts, "seeds_at_once": config.seeds_at_once}
@@ -57,7 +57,7 @@ def main(config: DictConfig) -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, signal.default_int_handler)
     try:
-        with one_sentence(OSError), Live(display.table(), refresh_per_second=1) as live:
+        with exit_on_error(OSError), Live(display.table(), refresh_per_second=1) as live:
             for _ in sweep:
                 live.update(display.table())
     except KeyboardInterrupt:

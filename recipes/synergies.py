@@ -29,7 +29,7 @@ from torchrl_etl.analysis import (
     vaf_curve,
 )
 from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
-from torchrl_etl.command_line import check_overrides, one_sentence, quote_paths
+from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH
 from torchrl_etl.synergies import (
@@ -47,7 +47,7 @@ HEADER = ("synergies", "fitted", "held out", "worst fold", "best fold")
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="recording")
 def main(config: DictConfig) -> None:
-    with one_sentence(ValueError, OSError):
+    with exit_on_error(ValueError, OSError):
         kind, options = kind_and_options(config)
         folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
         check_folder(folder)
@@ -201,7 +201,7 @@ def leave(
 
 if __name__ == "__main__":
     arguments = sys.argv[1:]
-    with one_sentence(ValueError):
+    with exit_on_error(ValueError):
         for i, argument in enumerate(arguments):
             if argument.startswith("kind="):
                 kinds = list(group_files(CONF, "synergies"))  # one's own, too

@@ -19,9 +19,9 @@ from omegaconf import DictConfig
 
 from torchrl_etl.analysis.viewer import Session, Subject
 from torchrl_etl.command_line import (
-    OPENING_FAULTS,
+    OPENING_ERRORS,
     check_overrides,
-    one_sentence,
+    exit_on_error,
     quiet_torchrl,
     quote_paths,
 )
@@ -35,7 +35,7 @@ SOURCES = ("run", "zoo", "bundle")
 @hydra.main(version_base="1.3", config_path="conf", config_name="view")
 def main(config: DictConfig) -> None:
     quiet_torchrl()
-    with one_sentence(*OPENING_FAULTS):
+    with exit_on_error(*OPENING_ERRORS):
         from torchrl_etl.analysis.viewer.page import Page, check_port  # needs an extra
 
         check_port(config.host, config.port)

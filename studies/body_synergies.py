@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.analysis import control_authority, joint_effects
 from torchrl_etl.checks import renaming
-from torchrl_etl.command_line import one_sentence, quiet_torchrl
+from torchrl_etl.command_line import exit_on_error, quiet_torchrl
 from torchrl_etl.envs import (
     actuator_names,
     body_decoder,
@@ -50,7 +50,7 @@ def main() -> None:
     control.add_argument("--still", action="store_true", help="one synergy that moves no muscle")
     arguments = parser.parse_args()
     quiet_torchrl()
-    with one_sentence(ValueError, OSError):
+    with exit_on_error(ValueError, OSError):
         env = make_env(arguments.task, seed=0)
         env.reset()
         torques = joint_torques(env)

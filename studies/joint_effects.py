@@ -27,7 +27,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_etl.analysis import joint_effects
-from torchrl_etl.command_line import one_sentence, quiet_torchrl
+from torchrl_etl.command_line import exit_on_error, quiet_torchrl
 from torchrl_etl.envs import body_decoder, excitation, joint_torques, make_env, muscle_changes
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import load_bundle
@@ -48,7 +48,7 @@ def main() -> None:
     quiet_torchrl()
     tasks = known_tasks(arguments.out)
     for run in arguments.runs:
-        with one_sentence(ValueError, OSError):
+        with exit_on_error(ValueError, OSError):
             config = resumed_config(run)
             for row in rows_of(run, config, with_references=config.env not in tasks):
                 append(arguments.out, row)

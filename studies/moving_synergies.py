@@ -24,7 +24,7 @@ from torchrl_etl.gl_backend import draw_without_display
 draw_without_display()
 from torchrl_etl.analysis.moving_pictures import FPS, write_moving_pictures
 from torchrl_etl.analysis.viewer import Session
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.inspection import open_bundle
 from torchrl_etl.training import EpisodeRecorder
 
@@ -34,7 +34,7 @@ SIZE = (180, 212)  # pixels of a panel
 
 
 def main(bundle: str, folder: str, task: str | None = None) -> None:
-    with one_sentence(ValueError, OSError, RuntimeError):
+    with exit_on_error(ValueError, OSError, RuntimeError):
         session = Session(open_bundle(Path(bundle), task))
         session.model.site_rgba[:, 3] = 0.0  # hide the goals of the task
         with EpisodeRecorder(session.env, size=SIZE) as recorder:

@@ -17,7 +17,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.envs import make_env
 from torchrl_etl.envs.joint_torques import active_torques
 from torchrl_etl.envs.simulator import mujoco_state, simulator
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--joints", nargs="*", default=["mcp3", "pm3", "md3"], help="name parts")
     parser.add_argument("--out", type=Path, help="CSV file to write; default: the terminal")
     arguments = parser.parse_args()
-    with one_sentence(ValueError, OSError):
+    with exit_on_error(ValueError, OSError):
         env = make_env(arguments.task, seed=0)
         env.reset()
         rows = list(torques(env, arguments.joints))

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
 from torchrl_etl.training.checkpoints import Checkpoints
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="CSV file to append to")
     arguments = parser.parse_args()
     for run in arguments.runs:
-        with one_sentence(ValueError, OSError):
+        with exit_on_error(ValueError, OSError):
             config = resumed_config(run, ["compile=false"])
             experiment = Experiment(config, resume=run)
             stage = experiment.learned()  # or a clear error; the full checkpoint is loaded below

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.envs.simulator import simulator
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.training import resumed_config
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, help="CSV file to write")
     arguments = parser.parse_args()
-    with one_sentence(ValueError, OSError):
+    with exit_on_error(ValueError, OSError):
         experiment = Experiment(resumed_config(arguments.run), resume=arguments.run)
         stage = experiment.learned()
     env = experiment.context.make_env()

@@ -30,7 +30,7 @@ from torchrl_etl import zoo
 from torchrl_etl.analysis.moving_pictures import FPS, animated_picture
 from torchrl_etl.analysis.viewer.framing import planes
 from torchrl_etl.checks import check_choice
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.envs import (
     EnvironmentSpec,
     has_free_root,
@@ -60,7 +60,7 @@ FIRST_SEEDS_APART = 100  # otherwise tasks with the same body would have the sam
 
 
 def main(*names: str) -> None:
-    with one_sentence(ValueError, OSError, RuntimeError):
+    with exit_on_error(ValueError, OSError, RuntimeError):
         shown = names_of_all()
         for name in names:
             check_choice("NAME", name, shown)

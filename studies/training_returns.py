@@ -18,7 +18,7 @@ from statistics import fmean
 from omegaconf import OmegaConf
 from rows import append
 
-from torchrl_etl.command_line import one_sentence
+from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.training.run_folder import RunFolder
 
 
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="CSV file to append to")
     arguments = parser.parse_args()
     for run in arguments.runs:
-        with one_sentence(OSError):
+        with exit_on_error(OSError):
             config = OmegaConf.load(run / "config.yaml")
         folder = RunFolder(run, config)
         if not (starts := folder.versions):

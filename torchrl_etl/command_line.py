@@ -30,17 +30,17 @@ with extra("recipes"):
     from yaml import YAMLError
 
 __all__ = [
-    "OPENING_FAULTS",
+    "OPENING_ERRORS",
     "check_overrides",
+    "exit_on_error",
     "interval_in_words",
-    "one_sentence",
     "print_intervals",
     "quiet_torchrl",
     "quote_paths",
     "translate",
 ]
 
-OPENING_FAULTS = (ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error)
+OPENING_ERRORS = (ValueError, OSError, ImportError, SimulationError, gymnasium.error.Error)
 """Errors with a clear message when a run, a bundle or a zoo entry is opened."""
 
 
@@ -64,10 +64,10 @@ def check_overrides(
     for argument in arguments:
         key, separator, value = argument.lstrip("+").partition("=")
         if key in groups and separator:
-            with one_sentence(ValueError):
+            with exit_on_error(ValueError):
                 _check_file(config.parent, key, value)
             chosen.append(f"{key}={value}")
-    with one_sentence(HydraException, YAMLError):
+    with exit_on_error(HydraException, YAMLError):
         settings, choices = _composed(config, chosen)
     if {"-h", "--help"} & set(arguments):
         own, _, _ = text.partition("\nhydra:")
@@ -92,7 +92,7 @@ def check_overrides(
             hint = f"did you mean {' or '.join(near)}?" if near else "--help lists them all."
             of = f"with {section}={choices[section]} " if choices.get(section) else ""
             sys.exit(f"Error: {of}there is no setting {key!r}; {hint}")
-        with one_sentence(ValueError):
+        with exit_on_error(ValueError):
             check_prefix(parse_override(argument), key in known)
 
 
@@ -164,7 +164,7 @@ def quote_paths(arguments: list[str], *keys: str) -> list[str]:
 
 
 @contextmanager
-def one_sentence(*kinds: type[Exception]) -> Iterator[None]:
+def exit_on_error(*kinds: type[Exception]) -> Iterator[None]:
     """Print an error of these kinds as one line and exit with code 2; Ctrl-C exits with 130."""
     try:
         yield

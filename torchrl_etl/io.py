@@ -14,12 +14,12 @@ from typing import IO, Any, TypeVar
 
 __all__ = [
     "as_json",
+    "check_disk_space",
     "flush_folder",
-    "own_folder",
     "read_bytes",
     "read_json",
     "replace_folder",
-    "require_room",
+    "replaceable_folder",
     "reserve",
     "surviving_folder",
     "write_atomically",
@@ -59,7 +59,7 @@ def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str
     return content
 
 
-def own_folder(
+def replaceable_folder(
     path: str | os.PathLike[str], names: Collection[str], what: str, error: type[ValueError]
 ) -> Path:
     """The resolved path of a folder to be replaced, which may hold only files of these names.
@@ -67,7 +67,7 @@ def own_folder(
     If it holds others, or is a file, raises ``error``; ``what`` names the content to be saved.
 
     Examples:
-        >>> own_folder("recipes", ["card.json"], "an entry", ValueError)
+        >>> replaceable_folder("recipes", ["card.json"], "an entry", ValueError)
         Traceback (most recent call last):
         ...
         ValueError: ...recipes holds ..., and saving an entry there would remove it; choose ...
@@ -192,7 +192,7 @@ def reserve(path: Path) -> None:
         _allocate(file, path.stat().st_size, path.parent)
 
 
-def require_room(folder: Path, size: int) -> None:
+def check_disk_space(folder: Path, size: int) -> None:
     """Raise an ``OSError`` unless ``size`` more bytes can be written to ``folder``.
 
     Allocates them briefly, since the reported free space ignores quotas and limits.

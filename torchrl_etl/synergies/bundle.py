@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from tensordict.utils import NestedKey
 
 from torchrl_etl.checks import not_finite
-from torchrl_etl.io import own_folder, read_bytes, replace_folder, surviving_folder
+from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder, surviving_folder
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies.bundle_info import (
     COPY_AGAIN,
@@ -122,7 +122,7 @@ def save_bundle(
         encoder=None if encoder is None else _plain(encoder.config, "encoder"),
     )
     description = json.dumps(asdict(info), indent=2, allow_nan=False).encode() + b"\n"
-    folder = own_folder(path, BUNDLE_FILES, "a bundle", BundleError)
+    folder = replaceable_folder(path, BUNDLE_FILES, "a bundle", BundleError)
     replace_folder(folder, {_TENSORS: tensors, DESCRIPTION: description})
     return folder
 
@@ -227,7 +227,7 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
     """
     files, target = bundle_files(source), Path(target).resolve()
     if _find_folder(Path(source)) != target:
-        replace_folder(own_folder(target, BUNDLE_FILES, "a bundle", BundleError), files)
+        replace_folder(replaceable_folder(target, BUNDLE_FILES, "a bundle", BundleError), files)
     return target
 
 

@@ -15,7 +15,7 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from torchrl.data import ReplayBuffer
 
-from torchrl_etl.io import flush_folder, require_room, write_atomically
+from torchrl_etl.io import check_disk_space, flush_folder, write_atomically
 
 __all__ = ["Checkpoints"]
 
@@ -40,7 +40,7 @@ class Checkpoints(CheckpointRotation):
         """Save, flush and seal a checkpoint of frame ``step``; returns its folder."""
         self._remove_leftovers()
         # TorchRL memory-maps sparse files; on a full disk, writing to one kills the process.
-        require_room(self.directory, _size(checkpoint.components) + _SMALL_FILES)
+        check_disk_space(self.directory, _size(checkpoint.components) + _SMALL_FILES)
         folder = self._checkpoint_path(step, "directory")
         fresh = folder.with_name(f".{folder.name}.stage-unsealed")
         try:

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import check_choice, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
-from torchrl_etl.io import own_folder, read_bytes, replace_folder
+from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.synergies.bundle_info import some
@@ -241,7 +241,7 @@ def save_entry(
     Raises:
         ZooError: if the folder holds other files, or the card does not describe the policy.
     """
-    folder = own_folder(folder, (CARD, WEIGHTS, *BUNDLE_FILES), "an entry", ZooError)
+    folder = replaceable_folder(folder, (CARD, WEIGHTS, *BUNDLE_FILES), "an entry", ZooError)
     state = {key: value.detach().cpu().clone() for key, value in policy.state_dict().items()}
     weights = safetensors.torch.save(state)
     files = {} if bundle is None else bundle_files(bundle)
