@@ -26,7 +26,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_etl import zoo
-from torchrl_etl.analysis.moving_pictures import write_moving_pictures
+from torchrl_etl.analysis.animation import write_animation
 from torchrl_etl.checks import check_flag, check_integer, check_real
 from torchrl_etl.command_line import (
     OPENING_ERRORS,
@@ -147,7 +147,7 @@ def draw_episodes(config: DictConfig, trained: Trained, recorder: EpisodeRecorde
         caption: recorder.record(policy, config.video_episodes)
         for caption, policy in policies.items()
     }
-    return write_moving_pictures(trained.folder / "videos", sides)
+    return write_animation(trained.folder / "videos", sides)
 
 
 def beside(card: zoo.Card, evaluation: Evaluation) -> str:

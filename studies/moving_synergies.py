@@ -22,7 +22,7 @@ import numpy as np
 from torchrl_etl.gl_backend import draw_without_display
 
 draw_without_display()
-from torchrl_etl.analysis.moving_pictures import FPS, write_moving_pictures
+from torchrl_etl.analysis.animation import FPS, write_animation
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.command_line import exit_on_error
 from torchrl_etl.inspection import open_bundle
@@ -43,7 +43,7 @@ def main(bundle: str, folder: str, task: str | None = None) -> None:
                 f"synergy {synergy + 1}": [moved(session, recorder, synergy)]
                 for synergy in range(number)
             }
-        for path in write_moving_pictures(Path(folder), sides, "moving_synergies"):
+        for path in write_animation(Path(folder), sides, "moving_synergies"):
             print(path)
 
 

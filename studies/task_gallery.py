@@ -27,7 +27,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 
 from torchrl_etl import zoo
-from torchrl_etl.analysis.moving_pictures import FPS, animated_picture
+from torchrl_etl.analysis.animation import FPS, animated_picture
 from torchrl_etl.analysis.viewer.framing import planes
 from torchrl_etl.checks import check_choice
 from torchrl_etl.command_line import exit_on_error

@@ -16,12 +16,12 @@ def test_budget_is_the_largest_that_all_runs_reached(tmp_path):
     comparison = compare(runs, ["sac", "etl"], "sac", repetitions=FEW)
     assert comparison.result("etl").returns.tolist() == [5.0]
     assert comparison.result("etl").improvement == 1.0
-    assert comparison.result("sac").improvement is None and not comparison.stale
+    assert comparison.result("sac").improvement is None and not comparison.evaluated_early
     # At other frames than etl's: sac's last evaluation before the budget counts, marked as stale.
     runs = sweep(tmp_path, sac, run([0, 4, 8], [0, 30_000, 80_000], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", repetitions=FEW)
     assert comparison.budget == 80_000 and comparison.result("sac").returns.tolist() == [1.0]
-    assert [one.method for one in comparison.stale] == ["sac"]
+    assert [one.method for one in comparison.evaluated_early] == ["sac"]
 
 
 def test_budget_tolerates_a_batch_more_or_less(tmp_path):
@@ -34,7 +34,7 @@ def test_budget_tolerates_a_batch_more_or_less(tmp_path):
         assert comparison.budget == (frames or 50_048)
         assert comparison.result("sac").returns.tolist() == [2.0]
         assert comparison.result("sar").returns.tolist() == [4.0]
-        assert not comparison.short and not comparison.stale
+        assert not comparison.ended_early and not comparison.evaluated_early
     assert compare(runs, ["etl"], "sac", frames=50_000).result("etl").returns.tolist() == [5.0]
 
 
@@ -42,7 +42,7 @@ def test_runs_shorter_than_a_given_budget_are_left_out(tmp_path):
     runs = sweep(tmp_path, run([0, 1, 2, 3]), run([0, 5], method="etl")).runs
     comparison = compare(runs, ["sac", "etl"], "sac", frames=150_000, repetitions=FEW)
     assert comparison.result("etl") is None
-    assert [one.method for one in comparison.short] == ["etl"]
+    assert [one.method for one in comparison.ended_early] == ["etl"]
 
 
 def test_frames_to_the_controls_return_use_the_mean_over_seeds(tmp_path):

@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_etl.analysis.viewer import Session, Subject
 from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, seen
+from torchrl_etl.analysis.viewer.html import activation_grid, driven_list, status
 from torchrl_etl.analysis.viewer.muscles import activations, colors, driven_muscles, paths
-from torchrl_etl.analysis.viewer.words import activation_grid, driven_list, status
 from torchrl_etl.envs import actuator_names, make_env, mujoco_state, resolve_task
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.training.evaluation import evaluate

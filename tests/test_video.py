@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 
 from tests.commands import command
 from torchrl_etl import zoo
-from torchrl_etl.analysis.moving_pictures import side_by_side, write_moving_pictures
+from torchrl_etl.analysis.animation import side_by_side, write_animation
 from torchrl_etl.analysis.viewer.framing import middle_and_size
 from torchrl_etl.analysis.viewer.muscles import activations, colors, pulled_tendons
 from torchrl_etl.envs import make_env, mujoco_state
@@ -172,7 +172,7 @@ def test_video_and_animation_are_written_without_leftovers(tmp_path):
     episode = np.broadcast_to(brightness, (9, 16, 32, 3))
     clips = [episode[:4], episode]
     sides = {"before training": clips, "after training": clips[::-1]}
-    video, picture = write_moving_pictures(tmp_path / "videos", sides)
+    video, picture = write_animation(tmp_path / "videos", sides)
     assert sorted(path.name for path in video.parent.iterdir()) == [picture.name, video.name][::-1]
     with Image.open(picture) as image:
         assert image.size == (2 * 2 * 32, 24 + 16)

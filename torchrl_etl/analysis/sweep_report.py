@@ -182,12 +182,12 @@ def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[
         notes.append(f"Without a finished run that reached the budget: {', '.join(absent)}.")
     if len({len(result.seeds) for result in comparison.results}) > 1:
         notes.append("The methods have unequal numbers of seeds.")
-    if comparison.short:
-        notes.append(f"Left out, ended before the budget: {_runs(comparison.short)}.")
-    if comparison.stale:
+    if comparison.ended_early:
+        notes.append(f"Left out, ended before the budget: {_runs(comparison.ended_early)}.")
+    if comparison.evaluated_early:
         notes.append(
             "Counted with an evaluation more than 5 % before the budget: "
-            f"{_runs(comparison.stale)}."
+            f"{_runs(comparison.evaluated_early)}."
         )
     env_id = environment_id(*comparison.setting)
     if published_curves(env_id) or published_curves(env_id, "success"):

@@ -91,7 +91,7 @@ class SweepRun:
     def evaluated(self) -> bool:
         return any(math.isfinite(row.mean_return) for row in self.rows)
 
-    def at(self, frames: int) -> SweepRow | None:
+    def evaluation_at(self, frames: int) -> SweepRow | None:
         """The last evaluation up to 1 % past ``frames``.
 
         Runs end with a whole batch, so slightly past their budget.

@@ -59,8 +59,8 @@ class Comparison:
         results: One per method, in the order of the methods.
         untrained: Mean return of the evaluations at ``untrained_frames``, over all runs.
         untrained_frames: The smallest number of frames at which a run was evaluated; usually 0.
-        short: Runs left out because they ended before the budget.
-        stale: Runs whose last evaluation within the budget is more than 5 % before it.
+        ended_early: Runs left out because they ended before the budget.
+        evaluated_early: Runs whose last evaluation within the budget is more than 5 % before it.
     """
 
     setting: tuple[str, str]
@@ -68,8 +68,8 @@ class Comparison:
     results: tuple[MethodResult, ...]
     untrained: float
     untrained_frames: int
-    short: tuple[SweepRun, ...]
-    stale: tuple[SweepRun, ...]
+    ended_early: tuple[SweepRun, ...]
+    evaluated_early: tuple[SweepRun, ...]
 
     def result(self, method: str) -> MethodResult | None:
         return next((result for result in self.results if result.method == method), None)
@@ -87,7 +87,9 @@ def common_budget(runs: Sequence[SweepRun]) -> int:
         raise ValueError("There are no finished runs to compare; finish at least one.")
     end = min(run.last_frames for run in runs)
     evaluated = {row.frames for run in runs for row in run.rows if 0 < row.frames <= end}
-    shared = (b for b in sorted(evaluated, reverse=True) if not any(_stale(r, b) for r in runs))
+    shared = (
+        b for b in sorted(evaluated, reverse=True) if not any(_evaluated_early(r, b) for r in runs)
+    )
     return next(shared, end)
 
 
@@ -111,9 +113,13 @@ def compare(
     if len({run.setting for run in runs}) != 1:
         raise ValueError("Compare the finished runs of one task and goal; pass no others.")
     budget = common_budget(runs) if frames is None else frames
-    fair = [run for run in runs if run.last_frames >= (1 - _TOLERANCE) * budget and run.at(budget)]
+    fair = [
+        run
+        for run in runs
+        if run.last_frames >= (1 - _TOLERANCE) * budget and run.evaluation_at(budget)
+    ]
     by_method = {name: [run for run in fair if run.method == name] for name in methods}
-    baseline = [run.at(budget).mean_return for run in by_method.get(control, ())]
+    baseline = [run.evaluation_at(budget).mean_return for run in by_method.get(control, ())]
     first = min(run.rows[0].frames for run in runs)
     untrained = [run.rows[0].mean_return for run in runs if run.rows[0].frames == first]
     return Comparison(
@@ -126,8 +132,8 @@ def compare(
         ),
         untrained=float(np.mean(untrained)),
         untrained_frames=first,
-        short=tuple(run for run in runs if run not in fair),
-        stale=tuple(run for run in fair if _stale(run, budget)),
+        ended_early=tuple(run for run in runs if run not in fair),
+        evaluated_early=tuple(run for run in fair if _evaluated_early(run, budget)),
     )
 
 
@@ -230,7 +236,7 @@ def _result(
     is_control: bool,
     repetitions: int,
 ) -> MethodResult:
-    rows = [run.at(budget) for run in runs]
+    rows = [run.evaluation_at(budget) for run in runs]
     columns = ("frames", "mean_return", "solved", "solved_time", "wall_seconds")
     frames, returns, *others = (
         np.array([getattr(row, name) for row in rows], float) for name in columns
@@ -247,14 +253,14 @@ def _result(
 def _first_at(runs: Sequence[SweepRun], target: float, budget: int) -> int | None:
     """Frames of the first evaluation within the budget where the runs' mean reaches the target."""
     begun = max(run.rows[0].frames for run in runs)
-    end = max(run.at(budget).frames for run in runs)
+    end = max(run.evaluation_at(budget).frames for run in runs)
     evaluated = {row.frames for run in runs for row in run.rows if begun <= row.frames <= end}
     for frames in sorted(evaluated):
-        if np.mean([run.at(frames).mean_return for run in runs]) >= target:
+        if np.mean([run.evaluation_at(frames).mean_return for run in runs]) >= target:
             return frames
     return None
 
 
-def _stale(run: SweepRun, budget: int) -> bool:
-    row = run.at(budget)
+def _evaluated_early(run: SweepRun, budget: int) -> bool:
+    row = run.evaluation_at(budget)
     return row is None or row.frames < (1 - _TOLERANCE) * budget

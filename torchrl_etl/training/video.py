@@ -10,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from torchrl_etl.analysis.moving_pictures import CAPTION_HEIGHT, FPS, grid_shape
+from torchrl_etl.analysis.animation import CAPTION_HEIGHT, FPS, grid_shape
 from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, middle_and_size, planes, scenery
 from torchrl_etl.checks import check_integer
 from torchrl_etl.envs import has_free_root, mujoco_state

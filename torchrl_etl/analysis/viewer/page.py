@@ -16,9 +16,9 @@ import torch
 
 from torchrl_etl.analysis.pictures import synergy_heatmap
 from torchrl_etl.analysis.viewer.body import Body
+from torchrl_etl.analysis.viewer.html import activation_grid, driven_list, status
 from torchrl_etl.analysis.viewer.muscles import activations, driven_muscles
 from torchrl_etl.analysis.viewer.session import Session
-from torchrl_etl.analysis.viewer.words import activation_grid, driven_list, status
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
 

@@ -21,7 +21,7 @@ __all__ = [
     "animated_picture",
     "grid_shape",
     "side_by_side",
-    "write_moving_pictures",
+    "write_animation",
 ]
 
 FPS = 25
@@ -75,7 +75,7 @@ def side_by_side(sides: Mapping[str, Sequence[np.ndarray]]) -> Iterator[np.ndarr
         yield frame
 
 
-def write_moving_pictures(
+def write_animation(
     folder: Path, sides: Mapping[str, Sequence[np.ndarray]], name: str = "episodes"
 ) -> list[Path]:
     """Write the frames of :func:`side_by_side` to ``name.mp4`` and, small enough for a page, to
