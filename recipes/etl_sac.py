@@ -56,7 +56,7 @@ SYNERGIES = (
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with exit_on_error(*OPENING_ERRORS, CollectionError):
-        runs = list(asked_for(config, list(HydraConfig.get().overrides.task)))
+        runs = list(configured_runs(config, list(HydraConfig.get().overrides.task)))
         apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
         if len(runs) > 1 and not apart and runs[0]["config"].collector.kind == "distributed":
             raise ValueError(
@@ -90,7 +90,7 @@ def main(config: DictConfig) -> None:
         sys.exit(130 if stopped else 2)
 
 
-def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
+def configured_runs(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
     """Arguments of ``Experiment`` for each configured run; there are several with ``seeds`` or a
     list of folders in ``resume``."""
     if config.resume is not None:
@@ -99,17 +99,17 @@ def asked_for(config: DictConfig, given: list[str]) -> Iterator[dict[str, Any]]:
             raise ValueError("resume is []; name folders of runs, such as resume=runs/NAME.")
         defaults = hydra.compose("config")
         for folder in map(Path, folders):
-            stored = settled(resumed_config(folder, given, defaults=defaults))
+            stored = resolve_collector(resumed_config(folder, given, defaults=defaults))
             yield {"config": stored, "resume": folder, "say": print}
         return
     # By default, runs that begin in the same second have the same name.
     named = any(override.lstrip("+").startswith("run_dir=") for override in given)
-    for own in split_seeds(settled(config)):
+    for own in split_seeds(resolve_collector(config)):
         say = print if config.seeds is None else partial(print, f"seed {own.seed}:")
         yield {"config": own, "resume": None, "unique": not named, "say": say}
 
 
-def settled(config: DictConfig) -> DictConfig:
+def resolve_collector(config: DictConfig) -> DictConfig:
     """The configuration with ``collector.kind=auto`` resolved."""
     return choose_layout(config, say=print) if config.collector.kind == "auto" else config
 

@@ -75,7 +75,7 @@ def main(config: DictConfig) -> None:
             )
             print(f"{number:>10}  " + "  ".join(f"{value:>10.3f}" for value in found[number]))
         chosen = enough_synergies(found, config.vaf)
-        leave(folder, recording, models[chosen], found, config)
+        write_results(folder, recording, models[chosen], found, config)
     enough = found[chosen].held_out >= config.vaf
     print(
         f"{chosen} {'synergy accounts' if chosen == 1 else 'synergies account'} for "
@@ -162,7 +162,7 @@ def numbers_of_synergies(num: Any, muscles: int) -> Sequence[int]:
     return numbers
 
 
-def leave(
+def write_results(
     folder: Path,
     recording: Recording,
     model: SynergyModel,

@@ -1,4 +1,4 @@
-"""studies/house.py on a small package with known call chains and checks."""
+"""studies/code_metrics.py on a small package with known call chains and checks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-STUDY = Path(__file__).parents[1] / "studies" / "house.py"
+STUDY = Path(__file__).parents[1] / "studies" / "code_metrics.py"
 PACKAGE = {
     "__init__.py": "",
     "functional/__init__.py": "def equation():\n    return 1\n",

@@ -1,7 +1,7 @@
 """Two metrics of the code: the longest call chain to an equation, and settings checked twice.
 
-    python studies/house.py CHECKOUT chain env=overactuated experiment=smoke run_dir=FOLDER
-    python studies/house.py CHECKOUT checks
+    python studies/code_metrics.py CHECKOUT chain env=overactuated experiment=smoke run_dir=FOLDER
+    python studies/code_metrics.py CHECKOUT checks
 
 A chain consists of the package's functions from the run down to a function of ``functional/`` that
 a loss calls. Suspended generators, in which a run pauses for an update, count too. Checks are
