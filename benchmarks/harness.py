@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.envs import make_env
 from torchrl_etl.modules import SynergyDecoder, make_actor
-from torchrl_etl.training import Stage, alone
+from torchrl_etl.training import Stage, run_alone
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.work import Work
 
@@ -56,7 +56,7 @@ def training(stage: Stage, updates: int, at_once: int) -> Work[None]:
 
 def train(stage: Stage, updates: int, at_once: int) -> None:
     """Run :func:`training` to its end."""
-    alone(training(stage, updates, at_once))
+    run_alone(training(stage, updates, at_once))
 
 
 class Child:

@@ -21,7 +21,7 @@ from harness import line, recipe
 
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 
 def resident_gigabytes() -> dict[str, float]:
@@ -56,7 +56,7 @@ def measure(arguments: argparse.Namespace, folder: str) -> None:
         stage.buffer.extend(copies)
     for _ in range(arguments.batches):
         stage.collect()
-        alone(stage.learn())
+        run_alone(stage.learn())
     for name, gigabytes in resident_gigabytes().items():
         case = f"{arguments.env}/{arguments.storage}/{name}"
         line("memory", case, "GB", [gigabytes], transitions=len(stage.buffer))

@@ -29,7 +29,7 @@ from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import Stage
-from torchrl_etl.training.together import together
+from torchrl_etl.training.interleaved import run_interleaved
 from torchrl_etl.training.work import Work
 
 STAGES = ("explore", "learn")
@@ -57,8 +57,8 @@ def seconds() -> float:
 def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, list[float]]:
     """Milliseconds per update of one seed for each block, after an unrecorded first block.
 
-    All blocks share one call of ``together``, which holds the compiled code. The work of the first
-    seed therefore takes the times, and also runs the sequential updates of all seeds.
+    All blocks share one call of ``run_interleaved``, which holds the compiled code. The work of the
+    first seed therefore takes the times, and also runs the sequential updates of all seeds.
     """
     taken: dict[str, list[float]] = {"one_by_one": [], "together": []}
 
@@ -73,7 +73,7 @@ def measured(stages: Sequence[Stage], repeats: int, block: int) -> dict[str, lis
             taken["together"].append(seconds() - middle)
 
     others = [training(stage, (repeats + 1) * block, at_once=AT_ONCE) for stage in stages[1:]]
-    for result in together([first(), *others]):
+    for result in run_interleaved([first(), *others]):
         if isinstance(result, BaseException):
             raise result
     updates = block * len(stages)

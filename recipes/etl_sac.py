@@ -38,7 +38,7 @@ from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.in_processes import in_processes
 from torchrl_etl.layout import choose_layout
-from torchrl_etl.training import Interrupted, resumed_config, together
+from torchrl_etl.training import Interrupted, resumed_config, run_interleaved
 from torchrl_etl.training.config import resume_setting, split_seeds
 from torchrl_etl.training.loop import StopOnSignal
 
@@ -72,7 +72,7 @@ def main(config: DictConfig) -> None:
         ends = in_processes(runs)
     else:
         with StopOnSignal() as stop:
-            found = together([experiment.work(stop) for experiment in experiments])
+            found = run_interleaved([experiment.work(stop) for experiment in experiments])
         ends = [(each.folder.path, end) for each, end in zip(experiments, found, strict=True)]
     for folder, end in ends:
         if isinstance(end, dict):

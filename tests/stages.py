@@ -12,7 +12,7 @@ from tests.configs import tiny
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import SynergyDecoder
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 from torchrl_etl.training.stage import Stage
 
 
@@ -62,7 +62,7 @@ def goes_on_after_a_load(make: Callable[[], Stage], folder: Path) -> bool:
     stage, twin = make(), make()
     stage.restart_collection()
     for _ in range(5):
-        stage.collect(), alone(stage.learn())
+        stage.collect(), run_alone(stage.learn())
     stage.checkpoint().save(folder / "saved")
     rows = []
     for one in (stage, twin):

@@ -12,7 +12,7 @@ import pytest
 
 from tests.configs import ROOT
 from tests.stages import fill, method_stage
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners import StackedLearners
 
 FOLDER = ROOT / "benchmarks"
 NAMES = ("bench", "end_to_end", "floor", "harness", "machine", "peers", "seeds", "update")
@@ -95,10 +95,10 @@ def test_updates_are_timed_as_training_makes_them(benchmarks):
 
 
 def test_seeds_are_timed_as_training_updates_them_together(benchmarks, monkeypatch):
-    calls, updates = [], SideBySide.updates
+    calls, updates = [], StackedLearners.updates
     monkeypatch.setattr(benchmarks.seeds, "AT_ONCE", 2)
     monkeypatch.setattr(
-        SideBySide,
+        StackedLearners,
         "updates",
         lambda self, inputs: calls.append(len(inputs[0])) or updates(self, inputs),
     )

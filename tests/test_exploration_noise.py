@@ -12,7 +12,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.exploration import LastingNoise
 from torchrl_etl.modules.lasting_noise import HeldNormal
 from torchrl_etl.synergies import load_bundle
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 NOISE = "exploration=noise"
 
@@ -38,7 +38,7 @@ def test_update_changes_only_the_gmvae(color):
     assert isinstance(learner.behavior.draw, HeldNormal) is (color == "held")
     others = learner.actor, learner.objective.sac
     before, model = [snapshot(part) for part in others], snapshot(found.model.model)
-    scalars = alone(stage.learn())
+    scalars = run_alone(stage.learn())
     assert "loss_gmvae" in scalars.keys() and "loss_actor" not in scalars.keys()
     assert changed(found.model.model, model)
     assert not any(changed(part, was) for part, was in zip(others, before, strict=True))
@@ -48,8 +48,8 @@ def test_update_changes_only_the_gmvae(color):
 def test_synergies_that_are_fitted_once_get_no_updates():
     found = explorer(NOISE, "synergies=pca")
     fill(found.stage)
-    assert alone(found.stage.learn()) is None and found.stage.progress.updates == 0
-    assert alone(found.condense()).num_synergies == 2
+    assert run_alone(found.stage.learn()) is None and found.stage.progress.updates == 0
+    assert run_alone(found.condense()).num_synergies == 2
     found.stage.close()
 
 

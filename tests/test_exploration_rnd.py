@@ -8,7 +8,7 @@ import torch
 from tests.stages import changed, explorer, fill, goes_on_after_a_load, prepared, snapshot
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.exploration import RNDExploration
-from torchrl_etl.learners import SideBySide
+from torchrl_etl.learners import StackedLearners
 
 SMALL = ("exploration=rnd", "exploration.hidden=[16]", "exploration.features=8")
 
@@ -75,7 +75,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
     for found in twins[0]:
         torch.manual_seed(0)
         batches.append(found.stage.sample())
-    group = SideBySide([found.stage.learner for found in twins[0]])
+    group = StackedLearners([found.stage.learner for found in twins[0]])
     inputs = []
     for learner, batch in zip(group.learners, batches, strict=True):
         torch.manual_seed(1)

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from tests.configs import CONF, ROOT
 from tests.stages import explorer, fill, prepared
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 PAGE = (ROOT / "docs" / "faithfulness.md").read_text(encoding="utf-8")
 TEST = re.compile(r"(tests/\w+\.py)::(\w+)")
@@ -145,7 +145,7 @@ def test_stage_1_metric_reads_the_task_reward_and_not_the_bonus():
 def test_gmvae_gets_final_updates_after_the_last_frame_unless_zero(updates, trained):
     found = explored(f"explore.fit.final_updates={updates}")
     before = found.model.model.prior_loc.clone()
-    alone(found.condense())
+    run_alone(found.condense())
     assert (not torch.equal(found.model.model.prior_loc, before)) is trained
 
 

@@ -11,7 +11,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_stage_1_finds_actions_in_the_subspace_that_moves_the_joints(basis):
     stage.restart_collection()
     while not stage.finished:
         stage.collect()
-        alone(stage.learn())
+        run_alone(stage.learn())
     stage.close()
     actions = explorer.actions(1500)
     deviation = actions - actions.mean(0)
@@ -71,6 +71,6 @@ def test_stage_2_solves_the_task_in_the_known_synergies(basis):
     stage.restart_collection()
     while not stage.finished:
         stage.collect()
-        alone(stage.learn())
+        run_alone(stage.learn())
     stage.close()
     assert evaluate().solved.mean >= 0.8

@@ -21,7 +21,7 @@ from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.methods import METHODS as CLASSES
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
-from torchrl_etl.training import alone, resumed_config
+from torchrl_etl.training import resumed_config, run_alone
 from torchrl_etl.training.checkpoints import Checkpoints
 from torchrl_etl.training.loop import StopOnSignal
 
@@ -306,7 +306,7 @@ def test_dynsyn_saves_its_groups_and_learns_on_them(tmp_path):
     with pytest.raises(OSError, match=r"muscle_groups\.json is not JSON .*; move it away, and the"):
         experiment.method.stage()
     file.unlink()
-    assert alone(experiment.method.prepare(StopOnSignal())) == {"groups": groups}
+    assert run_alone(experiment.method.prepare(StopOnSignal())) == {"groups": groups}
     stage = experiment.learned()
     observation = torch.randn(50, experiment.context.spec.observation_dim)
     action = stage.learner.actor(TensorDict({"observation": observation}, [50]))["action"]

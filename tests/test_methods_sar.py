@@ -11,7 +11,7 @@ from torchrl_etl.analysis import synergy_effects
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.sar import SAR, finished_episodes, rollouts
 from torchrl_etl.synergies import load_bundle
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 from torchrl_etl.training.loop import StopOnSignal
 
 
@@ -58,7 +58,7 @@ def test_play_rollouts_are_new_whole_episodes_without_updates(tmp_path):
         len(play.buffer),
     )
     checks = []
-    rows = alone(rollouts(play, 400, lambda: checks.append(None)))
+    rows = run_alone(rollouts(play, 400, lambda: checks.append(None)))
     assert 400 <= len(rows) < 400 + 32 and len(checks) == 13
     assert rows["next", "done"].sum() == 4  # an episode of 100 steps from each simulator
     assert not torch.equal(rows["next", "episode_reward"][: len(seen)], seen)
@@ -75,7 +75,7 @@ def test_play_rollouts_are_new_whole_episodes_without_updates(tmp_path):
 def test_sar_saves_a_bundle_that_its_run_does_not_read(tmp_path, monkeypatch):
     def prepared(run):
         sar = Experiment(rival("sar", run)).method
-        alone(sar.prepare(StopOnSignal()))
+        run_alone(sar.prepare(StopOnSignal()))
         return sar, sar.stage()
 
     sar, stage = prepared(tmp_path / "a")

@@ -19,7 +19,7 @@ from torchrl_etl.synergies import (
     fit_synergies,
     load_bundle,
 )
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 AFFINE = ("pca", "nmf", "sar")
 FEW = {"gmvae": {"updates": 20, "hidden": (8,)}, "vae": {"updates": 20, "hidden": (8,)}}
@@ -279,8 +279,8 @@ def test_affine_synergies_add_no_loss_to_stage_1(kind: str) -> None:
     for _ in range(6):
         found.stage.collect()
     found.stage.update()
-    decoder = alone(found.condense())
-    assert torch.equal(alone(found.condense())(torch.ones(2)), decoder(torch.ones(2)))
+    decoder = run_alone(found.condense())
+    assert torch.equal(run_alone(found.condense())(torch.ones(2)), decoder(torch.ones(2)))
     found.stage.close()
 
 

@@ -13,7 +13,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from tests.configs import RESIDUAL
 from tests.stages import changed, explorer, fill, learn_stage, method_stage, snapshot
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 
 def test_sac_scales_rewards_by_running_returns():
@@ -263,7 +263,7 @@ def test_learning_rates_decay_linearly_with_frames():
     initial = [group["lr"] for group in stage.learner.optimizer.param_groups]
     while not stage.finished:
         stage.collect()
-        alone(stage.learn())
+        run_alone(stage.learn())
         share = 1 - 0.5 * stage.frames / 640
         rates = [group["lr"] for group in stage.learner.optimizer.param_groups]
         assert rates == pytest.approx([share * lr for lr in initial])

@@ -19,7 +19,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.synergies import fit_gmvae
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 
 def test_prefill_copies_transitions_of_stage_1_and_adds_their_updates(tmp_path):
@@ -174,7 +174,7 @@ def test_synergies_are_fitted_to_actions_on_normalized_observations():
     with torch.no_grad():
         expected = found.stage.learner.behavior(rows)["loc"].tanh()
     torch.testing.assert_close(found.actions(), expected, atol=1e-5, rtol=1e-5)
-    assert alone(found.condense()).num_synergies == 2
+    assert run_alone(found.condense()).num_synergies == 2
     found.stage.close()
 
 
@@ -291,7 +291,7 @@ def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
     fill(first)
     for _ in range(3):
         first.update()
-    decoder = alone(found.condense())
+    decoder = run_alone(found.condense())
     before = copy.deepcopy([snapshot(found.exploration.encoder), snapshot(found.model.model)])
     second = learn_stage(decoder, "learn.decoder.lr=1e-2")
     fill(second)
@@ -309,7 +309,7 @@ def test_updates_follow_the_replay_ratio():
     stage = found.stage
     for _ in range(5):
         stage.collect()
-        alone(stage.learn())
+        run_alone(stage.learn())
     assert stage.progress.frames == 160
     assert stage.progress.updates == 16
     stage.close()
@@ -328,7 +328,7 @@ def test_frames_count_simulator_steps_under_action_repeat(tmp_path):
     )
     stage = Explorer(run.context).stage
     stage.restart_collection()
-    stage.collect(), alone(stage.learn())  # 32 actions
+    stage.collect(), run_alone(stage.learn())  # 32 actions
     assert stage.frames == 64 and len(stage.buffer) == 32 and stage.progress.updates == 16
     stage.close()
     summary = run.run()

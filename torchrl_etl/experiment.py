@@ -25,7 +25,7 @@ from torchrl_etl.training.evaluation import Evaluation, evaluate_task
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder, facts
 from torchrl_etl.training.stage import Stage
-from torchrl_etl.training.work import Work, alone
+from torchrl_etl.training.work import Work, run_alone
 from torchrl_etl.user_code import find_class
 
 if TYPE_CHECKING:
@@ -83,11 +83,11 @@ class Experiment:
     def run(self) -> dict[str, Any]:
         """Run the configured stages; returns the content of ``summary.json``, without versions."""
         with StopOnSignal() as stop:
-            return alone(self.work(stop))
+            return run_alone(self.work(stop))
 
     def work(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         """:meth:`run` as a generator that pauses at each update, see
-        :func:`~torchrl_etl.training.together`.
+        :func:`~torchrl_etl.training.run_interleaved`.
 
         Args:
             stop (StopOnSignal): checked after every batch.

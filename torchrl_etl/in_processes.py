@@ -18,7 +18,7 @@ import torch
 from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.layout import available_cores
-from torchrl_etl.training import Interrupted, alone
+from torchrl_etl.training import Interrupted, run_alone
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.sweep import end_with_parent
 
@@ -78,7 +78,7 @@ def _run(sender: Connection, run: Mapping[str, Any], threads: int) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
         experiment = Experiment(**run)
         try:
-            end = alone(experiment.work(stop))
+            end = run_alone(experiment.work(stop))
         except (Exception, Interrupted) as error:
             end = _sendable(error)
             end.add_note(traceback.format_exc())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.training import alone
+from torchrl_etl.training import run_alone
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -142,7 +142,7 @@ def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
 def train_on(stage: Stage) -> None:
     """Collect a batch and make its updates."""
     stage.collect()
-    alone(stage.learn())
+    run_alone(stage.learn())
 
 
 def training_speed(stage: Stage, seconds: float) -> float:

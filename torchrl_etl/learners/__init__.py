@@ -5,14 +5,14 @@ from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.parts import entropy_target, from_observation
 from torchrl_etl.learners.sac import SACLearner
-from torchrl_etl.learners.side_by_side import SideBySide
+from torchrl_etl.learners.stacked import StackedLearners
 from torchrl_etl.learners.term import Term
 
 __all__ = [
     "NORMALIZED",
     "Objective",
     "SACLearner",
-    "SideBySide",
+    "StackedLearners",
     "Term",
     "WarmedUpEMA",
     "build_learner",

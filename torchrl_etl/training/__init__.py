@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 from torchrl_etl.training.config import check_device, validate
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.evaluation import Evaluation, evaluate, evaluate_task
+from torchrl_etl.training.interleaved import run_interleaved
 from torchrl_etl.training.loop import Interrupted
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.sweep import Run, Sweep
-from torchrl_etl.training.together import together
 from torchrl_etl.training.video import EpisodeRecorder, check_video_size
-from torchrl_etl.training.work import alone
+from torchrl_etl.training.work import run_alone
 
 if TYPE_CHECKING:
     from torchrl_etl.training.resumed import resumed_config
@@ -23,13 +23,13 @@ __all__ = [
     "Run",
     "Stage",
     "Sweep",
-    "alone",
     "check_device",
     "check_video_size",
     "evaluate",
     "evaluate_task",
     "resumed_config",
-    "together",
+    "run_alone",
+    "run_interleaved",
     "validate",
 ]
 

@@ -124,7 +124,7 @@ def run_stage(
             stage.request()
             yield  # other seeds request their batches before this one waits
             report.batch(stage.collect(), (yield from stage.learn()))
-            while stage.behind and not stop.requested:
+            while stage.has_due_updates and not stop.requested:
                 yield from stage.learn()
             if _passed(before, stage.frames, log_every) or stage.finished:
                 report.write()

@@ -26,7 +26,7 @@ from torchrl_etl.learners import SACLearner
 from torchrl_etl.training.buffer_adapter import BufferAdapter
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
 from torchrl_etl.training.storage import make_storage
-from torchrl_etl.training.work import Due, Work
+from torchrl_etl.training.work import PendingUpdates, Work
 
 __all__ = ["Progress", "Stage"]
 
@@ -172,14 +172,14 @@ class Stage:
         self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
         if self.frames > self.learning_starts and len(self.buffer):
-            self.earn(batch.numel())
+            self.add_due_updates(batch.numel())
         return batch.reshape(-1)
 
     def learn(self) -> Work[TensorDictBase | None]:
         """Run the updates that are due; returns the mean of their scalars.
 
         A call runs at most twice the updates of one batch, so that the many updates due after a
-        prefill are spread over several calls; see :attr:`behind`.
+        prefill are spread over several calls; see :attr:`has_due_updates`.
         """
         due = min(int(self.progress.owed), self._most_updates)
         self.progress.owed -= due
@@ -190,10 +190,10 @@ class Stage:
         self.learner.advance(self.frames, self.frames / self.budget)
         return torch.cat(logs).mean(0) if logs else None
 
-    def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[Due]:
+    def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[PendingUpdates]:
         """Yield ``count`` updates on sampled batches, a few at a time, for the stage ``name``."""
         for few in parts(count, AT_ONCE[self.device.type]):
-            yield Due(name, learner, learner.inputs(self.samples(few)))
+            yield PendingUpdates(name, learner, learner.inputs(self.samples(few)))
 
     def samples(self, count: int) -> TensorDictBase:
         """Sample batches [count, B] from the buffer."""
@@ -208,12 +208,12 @@ class Stage:
         """One update on a sampled batch; returns scalars to log."""
         return self.updated.update(self.sample())
 
-    def earn(self, transitions: int) -> None:
+    def add_due_updates(self, transitions: int) -> None:
         """Add the updates due for this many transitions."""
         self.progress.owed += self.action_repeat * transitions * self.replay_ratio
 
     @property
-    def behind(self) -> bool:
+    def has_due_updates(self) -> bool:
         """Whether :meth:`learn` still has updates to run."""
         return self.progress.owed >= 1
 
@@ -229,7 +229,7 @@ class Stage:
         if self.learner.objective.normalizer is not None:
             self.learner.objective.normalizer.update_moments(rows["observation"])
         self.buffer.extend(rows.select(*self._kept))
-        self.earn(len(rows))
+        self.add_due_updates(len(rows))
 
     def newest(self, count: int) -> TensorDictBase:
         """Up to ``count`` of the latest transitions, oldest first."""

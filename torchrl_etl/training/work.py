@@ -10,12 +10,12 @@ from tensordict import TensorDictBase
 
 from torchrl_etl.learners import SACLearner
 
-__all__ = ["Due", "Work", "alone"]
+__all__ = ["PendingUpdates", "Work", "run_alone"]
 
 Result = TypeVar("Result")
 
 
-class Due(NamedTuple):
+class PendingUpdates(NamedTuple):
     """Updates that are due for a learner, with their inputs [k] and the name of the stage."""
 
     stage: str
@@ -25,10 +25,10 @@ class Due(NamedTuple):
 
 # Yields due updates, receives their scalars [k], and returns its result. It also yields None before
 # it waits for a batch from other processes.
-Work: TypeAlias = Generator[Due | None, TensorDictBase | None, Result]
+Work: TypeAlias = Generator[PendingUpdates | None, TensorDictBase | None, Result]
 
 
-def alone(work: Work[Result]) -> Result:
+def run_alone(work: Work[Result]) -> Result:
     """Run the work by itself, with each update as it becomes due."""
     with closing(work):
         try:

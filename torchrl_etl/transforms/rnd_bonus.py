@@ -92,7 +92,7 @@ class RNDBonus(ScaledBonus):
         self, observation: Tensor, next_observation: Tensor, tensordict: TensorDictBase
     ) -> Tensor:
         (error,) = self._error
-        # SideBySide replaces parameters by stacked tensors, so there may be none.
+        # StackedLearners replaces parameters by stacked tensors, so there may be none.
         seen = next_observation.to(next(error.parameters(), next_observation).device)
         if error.obs_rms is not None and self.update_statistics:
             error.obs_rms.update(seen)

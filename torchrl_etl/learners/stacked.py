@@ -14,10 +14,10 @@ from torchrl_etl.learners.objective import Objective
 from torchrl_etl.learners.parts import drawn_in
 from torchrl_etl.learners.sac import Gradients, SACLearner
 
-__all__ = ["SideBySide"]
+__all__ = ["StackedLearners"]
 
 
-class SideBySide:
+class StackedLearners:
     """Updates learners of equal architecture in one pass, as if each were updated alone.
 
     It runs the objective of the first learner under :func:`torch.vmap` over the stacked tensors of
@@ -38,7 +38,7 @@ class SideBySide:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
-        >>> from torchrl_etl.learners import SACLearner, SideBySide
+        >>> from torchrl_etl.learners import SACLearner, StackedLearners
         >>> from torchrl_etl.modules import make_actor, make_critic
         >>> spec = Bounded(-1, 1, shape=(2,))
         >>> def learner():
@@ -49,7 +49,7 @@ class SideBySide:
         >>> entries = {"observation": torch.randn(5, 4, 3), "action": torch.zeros(5, 4, 2)}
         >>> entries["next"] = {"observation": torch.randn(5, 4, 3), **ends}
         >>> batches = TensorDict(entries, [5, 4])  # for five updates
-        >>> group = SideBySide([learner(), learner()])
+        >>> group = StackedLearners([learner(), learner()])
         >>> logs = group.updates([each.inputs(batches) for each in group.learners])
         >>> [log["loss_qvalue"].shape for log in logs]
         [torch.Size([5]), torch.Size([5])]

@@ -12,7 +12,7 @@ from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor, set_frames
 from torchrl_etl.draws import standard_normal
-from torchrl_etl.learners import SACLearner, SideBySide
+from torchrl_etl.learners import SACLearner, StackedLearners
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.modules import make_actor, make_critic
@@ -52,7 +52,7 @@ def inputs(learners, batches):
 
 def with_stacked_weights(learners):
     """The learners side by side, with their weights stacked."""
-    group = SideBySide(learners)
+    group = StackedLearners(learners)
     group._take()
     return group
 
@@ -112,7 +112,7 @@ def test_stacked_updates_equal_updates_of_each_learner():
             stage.learner.parameters, lr=1e-2, eps=1.0, fused=True
         )
     starts = [snapshot(stage.learner.ema) for stage in theirs]
-    group = SideBySide([stage.learner for stage in ours])
+    group = StackedLearners([stage.learner for stage in ours])
     for _ in range(2):
         read = [stage.learner.inputs(stage.samples(3)) for stage in ours]
         group.updates(read)
@@ -221,7 +221,7 @@ def test_transforms_of_stacked_learners_share_no_state():
         learner.loss(own[0])[1]["loss_qvalue"]
         for learner, own in zip(learners, inputs, strict=True)
     ]
-    together = SideBySide(learners).updates(inputs)
+    together = StackedLearners(learners).updates(inputs)
     for learner, scalars, expected in zip(learners, together, alone, strict=True):
         torch.testing.assert_close(scalars["loss_qvalue"][0], expected.detach())
         (calls,) = learner.statistics.values()
@@ -231,7 +231,7 @@ def test_transforms_of_stacked_learners_share_no_state():
 def test_transform_with_an_undeclared_network_is_refused():
     learners, inputs = paid_learners(lambda: Pays(torch.nn.Linear(3, 1)))
     with pytest.raises(ValueError, match="Pays gives another reward than alone"):
-        SideBySide(learners).updates(inputs)
+        StackedLearners(learners).updates(inputs)
 
 
 def test_constant_reward_is_accepted():
@@ -241,7 +241,7 @@ def test_constant_reward_is_accepted():
         return pays_by(network, noise=0.0)
 
     learners, inputs = paid_learners(make)
-    SideBySide(learners).updates(inputs)
+    StackedLearners(learners).updates(inputs)
 
 
 def test_synergy_models_with_different_update_counts_are_refused():
@@ -258,15 +258,15 @@ def test_synergy_models_with_different_update_counts_are_refused():
     learners, inputs = zip(*fitters, strict=True)
     assert [learner.num_updates for learner in learners] == [1, 2]
     with pytest.raises(ValueError, match="updates and rates differ"):
-        SideBySide(learners).updates(inputs)
+        StackedLearners(learners).updates(inputs)
 
 
 def test_learners_of_different_sizes_are_refused():
     small, large = (learn_stage(None, f"actor.hidden=[{width}]") for width in (8, 16))
     with pytest.raises(ValueError, match=r"learners\[1\] has parameters of other shapes"):
-        SideBySide([small.learner, large.learner])
+        StackedLearners([small.learner, large.learner])
     with pytest.raises(ValueError, match="learners is empty"):
-        SideBySide([])
+        StackedLearners([])
     small.close(), large.close()
 
 
@@ -278,4 +278,4 @@ def test_learners_with_different_rates_are_refused(setting):
         stage.close()
     inputs = [stage.learner.inputs(stage.samples(1)) for stage in stages]
     with pytest.raises(ValueError, match="updates and rates differ"):
-        SideBySide([stage.updated for stage in stages]).updates(inputs)
+        StackedLearners([stage.updated for stage in stages]).updates(inputs)

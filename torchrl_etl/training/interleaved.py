@@ -9,35 +9,35 @@ from typing import Any, Generic
 from tensordict import TensorDictBase
 from torchrl.checkpoint import GlobalRNGState
 
-from torchrl_etl.learners import SACLearner, SideBySide
+from torchrl_etl.learners import SACLearner, StackedLearners
 from torchrl_etl.training.loop import Interrupted
-from torchrl_etl.training.work import Due, Result, Work, alone
+from torchrl_etl.training.work import PendingUpdates, Result, Work, run_alone
 
-__all__ = ["together"]
+__all__ = ["run_interleaved"]
 
 
-def together(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
+def run_interleaved(works: Sequence[Work[Result]]) -> list[Result | BaseException]:
     """Interleave several works, and run updates that are due at the same time in one pass.
 
     Each work requests a batch from its simulators before any of them waits for one. A work that is
     ahead of others in its stage, as after a resume, waits for them. Each has its own RNG state, so
-    its results equal those of :func:`~torchrl_etl.training.work.alone` up to rounding. If one fails
-    or is stopped, the others continue.
+    its results equal those of :func:`~torchrl_etl.training.work.run_alone` up to rounding. If one
+    fails or is stopped, the others continue.
 
     Args:
         works (sequence of generator): runs or stages, as for
-            :func:`~torchrl_etl.training.work.alone`.
+            :func:`~torchrl_etl.training.work.run_alone`.
 
     Returns:
         list: the return value of each work, or the exception that ended it.
     """
     if len(works) == 1:
         try:
-            return [alone(works[0])]
+            return [run_alone(works[0])]
         except (Exception, Interrupted) as error:
             return [error]
     runs = [_Run(work) for work in works]
-    groups: dict[tuple[SACLearner, ...], SideBySide] = {}
+    groups: dict[tuple[SACLearner, ...], StackedLearners] = {}
     try:
         while waiting := _those_with_updates_due(runs):
             learners = {run.due.learner for run in waiting}
@@ -66,7 +66,7 @@ class _Run(Generic[Result]):
 
     def __init__(self, work: Work[Result]) -> None:
         self.work, self.random = work, GlobalRNGState().state_dict()
-        self.due: Due | None = None
+        self.due: PendingUpdates | None = None
         self.ended = False
         self.result: Result | BaseException
 
@@ -109,7 +109,7 @@ def _behind(runs: Sequence[_Run]) -> list[_Run]:
 
 
 def _updated(
-    runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], SideBySide]
+    runs: Sequence[_Run], groups: dict[tuple[SACLearner, ...], StackedLearners]
 ) -> list[TensorDictBase]:
     """Run the due updates of these runs, all in the same stage; returns their scalars."""
     learners = tuple(run.due.learner for run in runs)
@@ -118,5 +118,5 @@ def _updated(
             return [learners[0].updates(runs[0].due.inputs)]
     group = groups.get(learners)
     if group is None:
-        group = groups[learners] = SideBySide(learners)
+        group = groups[learners] = StackedLearners(learners)
     return group.updates([run.due.inputs for run in runs])
