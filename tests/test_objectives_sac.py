@@ -236,7 +236,7 @@ def test_composite_action_under_one_key_gives_the_values_of_torchrls_loss() -> N
     assert_same_numbers(composite_actor(), critic, data)
 
 
-def test_counted_entropy_requires_a_tanh_gaussian_actor() -> None:
+def test_entropy_dims_require_a_tanh_gaussian_actor() -> None:
     with pytest.raises(ValueError, match="entropy_dims is 1, but the actor is no tanh-Gaussian"):
         LeanSACLoss(composite_actor(), make_critic({"observation": 3, "action": 2}), entropy_dims=1)
 

@@ -120,7 +120,7 @@ def test_both_losses_use_the_current_decoder(loss, data) -> None:
     assert seen[0][0] != seen[1][0] and seen[0][1] != seen[1][1]
 
 
-def test_entropy_includes_only_the_counted_coefficients(data) -> None:
+def test_entropy_dims_limit_the_entropy_to_the_coefficients(data) -> None:
     loss = make_loss(residual=0.5, entropy_dims=SYNERGIES)
     distribution = loss.get_stateful_net("actor_network").get_dist(data.clone())
     loc, scale = (part[..., :SYNERGIES] for part in (distribution.loc, distribution.scale))

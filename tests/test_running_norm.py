@@ -62,7 +62,7 @@ def test_outliers_are_clipped():
     assert norm(SEEN + 1e6).max() == 2.0
 
 
-def test_statistics_change_only_in_see_and_survive_a_round_trip():
+def test_statistics_change_only_in_update_moments_and_survive_a_round_trip():
     norm, other = RunningNorm(3), RunningNorm(3)
     norm.update_moments(SEEN)
     before = norm(SEEN)
