@@ -9,10 +9,12 @@ Column names are muscle names. All settings with their defaults:
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +29,21 @@ from torchrl_etl.analysis import (
     enough_synergies,
     synergy_heatmap,
     vaf_curve,
+    variance_accounted_for,
 )
 from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
 from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH
 from torchrl_etl.synergies import (
+    BundleError,
     Recording,
     SynergyModel,
     fit_synergies,
     read_recording,
     save_bundle,
 )
+from torchrl_etl.synergies.bundle_info import read_description
 from torchrl_etl.user_conf import group_files
 
 CONF = Path(__file__).parent / "conf"
@@ -52,6 +57,8 @@ def main(config: DictConfig) -> None:
         folder = Path(config.out or f"runs/{Path(config.data).stem}-{kind}")
         check_folder(folder)
         recording = load(config)
+        digest = hashlib.sha256(Path(config.data).read_bytes()).hexdigest()
+        check_recording(folder, digest)
         numbers = numbers_of_synergies(config.num, len(recording.muscles))
         trials = recording.trials
         by_trial = trials is not None and len(set(trials)) > 1
@@ -75,13 +82,14 @@ def main(config: DictConfig) -> None:
             )
             print(f"{number:>10}  " + "  ".join(f"{value:>10.3f}" for value in found[number]))
         chosen = enough_synergies(found, config.vaf)
-        write_results(folder, recording, models[chosen], found, config)
+        decoded = write_results(folder, recording, models[chosen], found, digest, config)
     enough = found[chosen].held_out >= config.vaf
     print(
         f"{chosen} {'synergy accounts' if chosen == 1 else 'synergies account'} for "
         f"{found[chosen].held_out:.0%} of held-out rows"
         + ("" if enough else f", none of these numbers for {config.vaf:.0%}")
     )
+    print(f"  the bundle's decoder, limited to the bounds, for {decoded:.0%} of all rows")
     print(f"  all of it   {folder}")
 
 
@@ -112,6 +120,14 @@ def check_folder(folder: Path) -> None:
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise ValueError(f"{there} is a file, so out={folder} can be no folder; choose another.")
+
+
+def check_recording(folder: Path, digest: str) -> None:
+    """Reject a folder with results of another recording; files in two folders may share a name."""
+    if (folder / "synergies").is_dir():
+        with suppress(BundleError):  # a damaged bundle is replaced
+            if digest != read_description(folder / "synergies").facts.get("recording", digest):
+                raise ValueError(f"{folder} holds synergies of another recording; pass out=FOLDER.")
 
 
 def load(config: DictConfig) -> Recording:
@@ -167,9 +183,10 @@ def write_results(
     recording: Recording,
     model: SynergyModel,
     found: dict[int, CrossValidation],
+    digest: str,
     config: DictConfig,
-) -> None:
-    """Write the table, the bundle and the plots."""
+) -> float:
+    """Write the table, the bundle and the plots; returns the VAF of the bundle's decoder."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("synergies", *CrossValidation._fields))
@@ -177,6 +194,8 @@ def write_results(
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "vaf.csv", text.getvalue())
     decoder = model.decoder(recording.activity)
+    rows_again = decoder(decoder.encode(recording.activity))
+    decoded = variance_accounted_for(recording.activity, rows_again.detach())
     save_bundle(
         decoder,
         folder / "synergies",
@@ -186,6 +205,8 @@ def write_results(
         facts={
             "vaf": found[model.num_synergies].fitted,
             "vaf_held_out": found[model.num_synergies].held_out,
+            "vaf_decoded": decoded,
+            "recording": digest,
             "rows": len(recording.activity),
             "seed": config.seed,
         },
@@ -197,6 +218,7 @@ def write_results(
         "held out": [of.held_out for of in found.values()],
     }
     vaf_curve(list(found), series, pictures / "vaf.png", chosen_d=model.num_synergies)
+    return decoded
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ def test_choose_layout_takes_and_names_the_fastest(speeds, fastest, kind, ahead)
     assert chosen.collector.kind == kind
     assert chosen.collector.num_workers == max(1, fastest.num_workers)
     assert (chosen.collector.ahead, chosen.threads) == (ahead, fastest.threads)
-    (line,) = said
+    before, line = said
+    assert before.startswith("collector=auto tries 4 ways to share the cores")
     assert line.startswith(f"collector=auto takes {kind}, ") and "90" in line
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -209,10 +210,24 @@ def test_command_writes_table_bundle_and_pictures(tmp_path, monkeypatch, capsys)
     assert (info.kind, info.actuators, info.num_synergies) == ("nmf", MUSCLES, 3)
     assert info.facts["vaf_held_out"] == pytest.approx(float(table[1]["held_out"]))
     with torch.no_grad():
-        told = decoder.module(decoder.encode(emg()))
-    assert variance_accounted_for(emg(), told) > 0.9
+        decoded = variance_accounted_for(emg(), decoder(decoder.encode(emg())))
+    assert info.facts["vaf_decoded"] == pytest.approx(decoded, abs=1e-4) and decoded > 0.9
+    assert f"the bundle's decoder, limited to the bounds, for {decoded:.0%} of all rows" in said
     for name in ("synergies.png", "vaf.png"):
         assert (folder / "pictures" / name).stat().st_size > 5_000
+
+
+def test_results_of_another_recording_are_not_overwritten(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for subject, rows in (("S01", 40), ("S02", 50)):
+        Path(subject).mkdir()
+        write(Path(subject) / "emg.csv", emg(rows))
+    first, second = (["synergies.py", f"data=S0{i}/emg.csv", "kind=pca", "num=2"] for i in (1, 2))
+    assert command(*first) == 0 and command(*first, "num=3") == 0  # the same one again
+    before = Path("runs/emg-pca/vaf.csv").read_bytes()
+    assert command(*second) == 2
+    assert "runs/emg-pca holds synergies of another recording; pass out=" in capsys.readouterr().err
+    assert Path("runs/emg-pca/vaf.csv").read_bytes() == before
 
 
 @pytest.mark.parametrize(

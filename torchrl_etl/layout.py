@@ -63,7 +63,7 @@ def choose_layout(
 
     Keyword Args:
         seconds (float): training time in each. Default: 2.
-        say (callable): called with one line on the measurements and the choice.
+        say (callable): called with one line before the trials and one on the outcome.
 
     Raises:
         ValueError: if the configuration is invalid or asks for several seeds.
@@ -75,6 +75,7 @@ def choose_layout(
         )
     per_worker, batch = config.collector.num_envs, config.collector.frames_per_batch
     candidates = layouts(available_cores(), batch // per_worker, config.threads)
+    say(f"collector=auto tries {len(candidates)} ways to share the cores, each for {seconds:g} s")
     trial = config.copy()
     trial.collector.update(candidates[0].collector)
     trial.learn.update({"buffer_storage": "memory", "buffer_size": 4096, "learning_starts": 0})
