@@ -60,6 +60,8 @@ def test_numpy_files_of_every_layout_are_read(tmp_path):
         assert found.muscles == MUSCLES, name
         np.testing.assert_array_equal(found.activity, activity)
         assert (found.trials is None) == (name == "fields.npy")
+    np.savez(tmp_path / "named.npz", emg=activity[:, :1], names=np.array(["großzehe".encode()]))
+    assert read_recording(tmp_path / "named.npz").muscles == ("großzehe",)
 
 
 @pytest.mark.parametrize(
@@ -108,8 +110,12 @@ def test_unreadable_file_is_refused(tmp_path):
     first = whole.index(b"PK\x01\x02")  # of the table of contents, which counts
     for name, at, byte in (("locked", first + 8, 1), ("method", first + 10, 99)):
         (tmp_path / f"{name}.npz").write_bytes(whole[:at] + bytes([byte]) + whole[at + 1 :])
-    vast = (tmp_path / "cube.npy").read_bytes().replace(b"(2, 3, 4), }    ", b"(200000000, 99999)}")
+    whole_array = (tmp_path / "cube.npy").read_bytes()
+    vast = whole_array.replace(b"(2, 3, 4), }    ", b"(200000000, 99999)}")
     (tmp_path / "vast.npy").write_bytes(vast)
+    for name, header in (("open", b"{'descr': ('<f8',"), ("unparsed", b"{'descr' '<f8' 1")):
+        start = whole_array[:10] + header
+        (tmp_path / f"{name}.npy").write_bytes(start + b" " * (128 - len(start)))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "two.npz").read_bytes()[:200])
     (tmp_path / "latin.csv").write_bytes("a,\xe4\n1,2\n".encode("latin-1"))
     (tmp_path / "emg.mat").write_bytes(b"x")
@@ -127,6 +133,8 @@ def test_unreadable_file_is_refused(tmp_path):
         "cut.npz": "does not hold arrays of numbers",
         "locked.npz": r"does not hold arrays of numbers \(.*encrypted",
         "method.npz": "does not hold arrays of numbers",
+        "open.npy": "does not hold arrays of numbers",
+        "unparsed.npy": "does not hold arrays of numbers",
         "vast.npy": r"does not hold arrays of numbers \(.*allocate",
         "latin.csv": "not a text in UTF-8",
         "emg.mat": "pass a .csv, .npy or .npz file",
@@ -144,8 +152,9 @@ def test_folds_keep_trials_together_and_are_balanced():
     assert len(held_out_rows(10, folds=9, trials=trials)) == 4
     with pytest.raises(ValueError, match="All rows are of trial a"):
         held_out_rows(3, trials=["a"] * 3)
-    with pytest.raises(ValueError, match="Row 2 has no trial"):
-        held_out_rows(4, trials=[0.0, 1.0, np.nan, 1.0])
+    for trials in ([0.0, 1.0, np.nan, 1.0], ["a", "b", None, "b"]):
+        with pytest.raises(ValueError, match="Row 2 has no trial"):
+            held_out_rows(4, trials=trials)
 
 
 class Mean:

@@ -61,7 +61,8 @@ def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) ->
     trials = np.asarray(trials)
     if trials.shape != (rows,):
         raise ValueError(f"{len(trials)} trials came for {rows} rows; pass one for each row.")
-    if (missing := np.flatnonzero(trials != trials)).size:  # NaN is no trial, not even its own
+    # NaN, which differs from itself, is no trial, nor is None.
+    if missing := [i for i, one in enumerate(trials.tolist()) if one is None or one != one]:
         raise ValueError(f"Row {missing[0]} has no trial; name it, or leave the row out.")
     names, sizes = np.unique(trials, return_counts=True)
     if len(names) < 2:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+import tokenize
 import zipfile
 import zlib
 from collections import Counter
@@ -89,7 +90,7 @@ def read_recording(
         if name not in named:
             raise ValueError(f"{path} has no column {name!r}; it has {', '.join(named)}.")
     trial = trial or "trial"
-    trials = next((np.asarray(c).astype(str) for name, c in columns if name == trial), None)
+    trials = next((_text(np.asarray(c)) for name, c in columns if name == trial), None)
     if trials is not None:
         for row, name in enumerate(trials):
             if name.strip().lower() in _MISSING:
@@ -199,12 +200,14 @@ def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
             found = {name: loaded[name] for name in loaded.files}
             # Of a file that is no array, NumPy hands out the bytes.
             return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
-    # A damaged archive can ask for a password, an unknown compression or all memory.
+    # A damaged file can ask for a password, an unknown compression or all memory, and not parse.
     except (
         ValueError,
         EOFError,
         zipfile.BadZipFile,
         zlib.error,
+        SyntaxError,
+        tokenize.TokenError,
         RuntimeError,
         MemoryError,
     ) as error:
@@ -222,9 +225,15 @@ def _columns(path: Path, array: np.ndarray, names: np.ndarray | None = None) -> 
             f"{path} holds an array of shape {array.shape}; it must be [rows, muscles]."
         )
     width = array.shape[1]
-    # Text in bytes, as of fixed width, is text.
-    named = [f"muscle_{i}" for i in range(width)] if names is None else names.astype(str).tolist()
+    named = [f"muscle_{i}" for i in range(width)] if names is None else _text(names).tolist()
     return list(zip(named, array.T, strict=True))
+
+
+def _text(array: np.ndarray) -> np.ndarray:
+    """An array as text; bytes, as of fixed width, are read as UTF-8."""
+    if array.dtype.kind == "S":
+        return np.char.decode(array, "utf-8", "replace")
+    return array.astype(str)
 
 
 def _numbers(path: Path, name: str, column: np.ndarray | list[str], lines: Lines) -> np.ndarray:
