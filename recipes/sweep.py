@@ -56,13 +56,14 @@ def main(config: DictConfig) -> None:
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, signal.default_int_handler)
-    try:
-        with exit_on_error(OSError), Live(display.table(), refresh_per_second=1) as live:
-            for _ in sweep:
-                live.update(display.table())
-    except KeyboardInterrupt:
-        print("Stopped; all runs are saved. Start it again to go on.")
-        sys.exit(130)
+    with exit_on_error(OSError):
+        try:
+            with Live(display.table(), refresh_per_second=1) as live:
+                for _ in sweep:
+                    live.update(display.table())
+        except KeyboardInterrupt:
+            print("Stopped; all runs are saved. Start it again to go on.")
+            sys.exit(130)
     failed = [run for run in runs if sweep.status(run) == "failed"]
     for run in failed:
         lines = run.log.read_text(encoding="utf-8").splitlines()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -170,6 +171,17 @@ def test_full_disk_ends_the_queue_and_names_the_file(tmp_path):
     ended = process("sweep.py", *what, cwd=tmp_path)
     assert ended.returncode == 2 and "Traceback" not in ended.stderr
     assert f"No space left on device: '{tmp_path}/.results.csv.tmp'" in ended.stderr
+
+
+def test_ctrl_c_says_that_all_runs_are_saved(tmp_path, monkeypatch, capsys):
+    def interrupt(sweep):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Sweep, "__iter__", interrupt)
+    monkeypatch.setattr(signal, "signal", lambda *given: None)
+    what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0]", f"out={tmp_path}"]
+    assert command("sweep.py", *what) == 130
+    assert "all runs are saved. Start it again to go on." in capsys.readouterr().out
 
 
 def test_closing_the_sweep_ends_its_runs(tmp_path):
