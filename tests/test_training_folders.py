@@ -125,11 +125,11 @@ def test_resume_names_a_damaged_file_and_works_without_it(name, content, copy):
 
 @pytest.mark.skipif(not FULL.exists(), reason="Linux has a disk that is always full")
 def test_full_disk_error_names_the_run(tmp_path):
-    folder = RunFolder(tmp_path, OmegaConf.create({"log": []}))
-    file = tmp_path / "csv" / "scalars" / "learn" / "return.csv"
+    folder = RunFolder(run := tmp_path / "my run", OmegaConf.create({"log": []}))
+    file = run / "csv" / "scalars" / "learn" / "return.csv"
     file.parent.mkdir(parents=True)
     file.symlink_to(FULL)
-    words = rf"{tmp_path} logs cannot be written \(No space left.*resume={tmp_path}\."
+    words = rf"{run} logs cannot be written \(No space left.*'resume={run}'\."
     with pytest.raises(OSError, match=words):
         folder.log({"learn/return": 1.0}, 5)
 

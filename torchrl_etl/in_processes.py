@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shlex
 import signal
 import traceback
 from collections.abc import Mapping, Sequence
@@ -101,6 +102,7 @@ def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
     except EOFError:  # the process was killed
         process.join()
         folder = Path(run["resume"] or run["config"].run_dir)
+        setting = shlex.quote(f"resume={folder}")
         return folder, ChildProcessError(
-            f"The process of {folder} ended with {process.exitcode}; go on with resume={folder}."
+            f"The process of {folder} ended with {process.exitcode}; go on with {setting}."
         )

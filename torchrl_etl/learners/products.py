@@ -16,7 +16,7 @@ from torch import Tensor
 
 __all__ = ["by_onednn", "faster_products", "multiply"]
 
-_SMALLEST = 16  # size of each outer dimension; below, MKL is faster
+_SMALLEST = 16  # of m, k and n each; below, MKL is faster
 
 
 def multiply(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:

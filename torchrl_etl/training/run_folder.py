@@ -156,9 +156,10 @@ class RunFolder:
                 for key, value in values.items():
                     logger.log_scalar(key, float(value), step=frame)
         except OSError as error:
+            setting = shlex.quote(f"resume={self.path}")
             raise OSError(
                 f"What {self.path} logs cannot be written ({error.strerror or error}); mend that, "
-                f"then go on with resume={self.path}."
+                f"then go on with {setting}."
             ) from error
 
     def series(self, key: str) -> tuple[list[int], list[float]]:
