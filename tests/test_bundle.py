@@ -132,6 +132,7 @@ DAMAGE = {
     "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
     "synergies of 1 actuators": lambda f: edit(f, actuators=["biceps"]),
     "states 99 synergies": lambda f: edit(f, num_synergies=99),
+    "states a residual of 0.5 for a decoder with 0.0": lambda f: edit(f, residual=0.5),
     "actuators that are no JSON strings": lambda f: edit(f, actuators=[1, 2, 3]),
     "There is no synergy bundle": shutil.rmtree,
 }

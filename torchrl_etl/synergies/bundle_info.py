@@ -102,6 +102,11 @@ def read_description(folder: Path) -> BundleInfo:
             )
     if not all(isinstance(name, str) for name in content["actuators"]):
         raise BundleError(f"{path} has actuators that are no JSON strings; copy the bundle again.")
+    if content["residual"] != (own := content["config"].get("residual", 0.0)):
+        raise BundleError(
+            f"{path} states a residual of {content['residual']!r} for a decoder with {own!r}; it "
+            "was edited, so copy the bundle again."
+        )
     if version == 1:
         content["kind"] = default_kind(not content["config"].get("hidden", True))
     if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
