@@ -24,6 +24,14 @@ def test_status_of_a_run_is_that_of_its_newest_row(tmp_path):
     assert [str(one) for one in results.unfinished] == ["myoHandKeyTurn (fixed), sac, seed 1"]
 
 
+def test_row_before_the_first_evaluation_gives_way_to_evaluations(tmp_path):
+    waiting = row(status="waiting", **{"return": ""})
+    (first,) = read_sweep(write(tmp_path / "first", [waiting])).runs
+    assert first.status == "waiting" and not first.evaluated
+    (later,) = read_sweep(write(tmp_path / "later", [waiting, row(frames=320)])).runs
+    assert later.finished and [each.frames for each in later.rows] == [320]
+
+
 def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
     tasks = ("aFarTask", "dog-run", "myoHandKeyTurn")
     results = sweep(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))

@@ -144,7 +144,8 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
 
     A run may have been repeated. Among rows with the same task, goal, method, seed and frames, the
     last one in the file counts. If a run has such repeated rows, its rows beyond the frames of its
-    last row are dropped as well.
+    last row are dropped as well. A row at frame 0 without a return, as before the first evaluation,
+    counts only if the run has no other rows.
 
     Raises:
         FileNotFoundError: if the folder or the file is missing.
@@ -186,7 +187,8 @@ def _runs(rows: list[SweepRow]) -> tuple[SweepRun, ...]:
     for row in rows:
         found.setdefault((row.task, row.goal, row.method, row.seed), []).append(row)
     runs = []
-    for attempts in found.values():
+    for of_run in found.values():
+        attempts = [r for r in of_run if r.frames or math.isfinite(r.mean_return)] or of_run
         latest = {row.frames: row for row in attempts}
         if len(latest) < len(attempts):
             reached = attempts[-1].frames
