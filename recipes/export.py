@@ -43,8 +43,8 @@ def main(config: DictConfig) -> None:
             raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
         check_choice("part", config.part, ("all", "synergies"))
         check_integer(1, episodes=config.episodes)
-        if "/" in str(config.name):  # and the entry would be made somewhere else
-            raise ValueError(f"name is {config.name!r}; it must be no path; pass out= for one.")
+        if "/" in str(config.name) or str(config.name) in (".", ".."):
+            raise ValueError(f"name is {config.name!r}; it must not be a path; use out= for one.")
         run = Path(config.run)
         trained = resumed_config(run, defaults=compose())
         task = resolve_task(trained.env, trained.goal)

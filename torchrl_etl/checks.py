@@ -107,6 +107,8 @@ def check_sizes(**values: object) -> None:
 def check_width(size: int, **tensors: Tensor) -> None:
     """Raise a ``ValueError`` naming the first tensor whose last size is not ``size``.
 
+    A last size of 1 would otherwise be broadcast.
+
     Examples:
         >>> import torch
         >>> check_width(4, synergy=torch.zeros(2, 1))
