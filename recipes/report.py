@@ -29,7 +29,7 @@ def main(arguments: Sequence[str]) -> None:
         frames = _count("frames", settings["frames"]) if settings["frames"] else None
         repetitions = _count("repetitions", settings["repetitions"])
         if not settings["results"]:
-            raise ValueError("no results are named; pass results=FOLDER, which has results.csv.")
+            raise ValueError("no results are given; pass results=FOLDER, which has results.csv.")
         sweep = read_sweep(settings["results"])
         folder = Path(settings["out"] or settings["results"])
         tasks, methods = write_report(
@@ -63,7 +63,7 @@ def _settings(arguments: Sequence[str]) -> dict[str, str]:
 
 def _count(name: str, text: str) -> int:
     if not text.isdecimal() or int(text) == 0:
-        raise ValueError(f"{name} is {text!r}; it must be a whole number from 1 up.")
+        raise ValueError(f"{name} is {text!r}; it must be a whole number, 1 or more.")
     return int(text)
 
 

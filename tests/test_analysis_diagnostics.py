@@ -71,11 +71,12 @@ def test_each_fault_gives_one_warning_with_its_numbers():
     good = {"vaf": 0.8, "pca_vaf": 0.75, "authority": torch.tensor([0.4, 0.6])}
     assert synergy_warnings(**good) == []
     faults = {
-        "hardly have synergies: the GMVAE accounts for 18%": {
+        "explain little of the actions' variance: 18% by the GMVAE": {
             "vaf": 0.18,
             "pca_vaf": 0.18,
         },
-        "60.0% of the actions' variance, less than PCA's 75.0%": {"vaf": 0.6},
+        "60.0% of the actions' variance, less than PCA "
+        "with the same number of dimensions (75.0%)": {"vaf": 0.6},
         "over 5% of its range": {"authority": torch.tensor([0.0, 0.1])},
     }
     for words, fault in faults.items():

@@ -44,7 +44,7 @@ def test_duplicate_joint_does_not_raise_chance():
 @pytest.mark.parametrize(
     ("activations", "torques", "words"),
     [
-        (np.eye(3), TORQUES, "activations of 3 muscles and torques of 4"),
+        (np.eye(3), TORQUES, "activations has 3 muscles and torques has 4"),
         (np.eye(4), np.zeros((1, 4)), "No muscle turns joint 0"),
         (np.ones((5, 4)), TORQUES, "do not vary"),
     ],

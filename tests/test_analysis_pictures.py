@@ -69,7 +69,7 @@ def test_heatmap(tmp_path, n, d, residual):
     decoder = SynergyDecoder(d, n, low=0.0, residual=residual)
     path = synergy_heatmap(decoder, [f"muscle{i}" for i in range(n)], tmp_path / "map.png")
     assert colors_of(path) > 20
-    with pytest.raises(ValueError, match=f"2 names came for {n} actuators"):
+    with pytest.raises(ValueError, match=f"2 names for {n} actuators"):
         synergy_heatmap(decoder, ["a", "b"], path)
 
 

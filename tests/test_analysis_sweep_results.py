@@ -42,13 +42,13 @@ def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
 @pytest.mark.parametrize(
     ("cells", "words"),
     [
-        ({"return": "12,5"}, "line 3: return is '12,5', which is not a number"),
+        ({"return": "12,5"}, "line 3: return is '12,5'; it must be a number"),
         ({"return": ""}, "line 3: .* is finished but this evaluation has no finite return"),
         ({"frames": "1.5"}, "line 3: frames is '1.5'; it must be a whole number"),
         ({"seed": ""}, "line 3: seed is ''"),
         ({"solved": "80"}, "line 3: solved is 80; it must be a share"),
         ({"method": " "}, "line 3: method is empty"),
-        ({"versions": "{torch"}, "line 3: versions is not a JSON text"),
+        ({"versions": "{torch"}, "line 3: versions is not valid JSON"),
         ({"versions": "[1]"}, "line 3: versions must be a JSON object"),
     ],
 )
@@ -75,5 +75,5 @@ def test_missing_folder_file_columns_and_rows_are_named(tmp_path):
     folder = write(tmp_path, [row()])
     with (folder / "results.csv").open("a") as file:
         file.write("myoHandKeyTurn,fixed,sac,0,1000")
-    with pytest.raises(ValueError, match="line 3: the number of cells"):
+    with pytest.raises(ValueError, match="line 3: the line does not have as many cells"):
         read_sweep(folder)

@@ -90,6 +90,9 @@ def test_overall_iqm_with_unequal_seeds_and_a_missing_task(tmp_path):
 def test_task_that_cannot_be_normalized_says_why(tmp_path):
     other = run([0, 1, 2], task="myoLegWalk", method="etl")
     worse = run([0, -1, -2], task="myoRelocate")
-    for rows, words in ((other, "sac lacks the task"), (worse, "is not above the untrained")):
+    for rows, words in (
+        (other, "sac has no run on this task"),
+        (worse, "is not above the untrained"),
+    ):
         comparison = compare(sweep(tmp_path, rows).runs, ["sac", "etl"], "sac", repetitions=FEW)
         assert words in normalize(comparison, "sac")

@@ -146,7 +146,7 @@ def test_stage_1_policy_follows_the_chosen_direction():
     session.follow(torch.tensor([0.0, -2.0, 0.0]))
     session.step()
     assert [direction.tolist() for direction in seen] == [[1, 0, 0], [0, -1, 0]]
-    with pytest.raises(ValueError, match="3 numbers that are not all zero"):
+    with pytest.raises(ValueError, match="3 numbers, not all zero"):
         session.follow(torch.zeros(3))
 
 

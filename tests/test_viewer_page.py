@@ -83,7 +83,7 @@ def test_every_click_draws_another_direction():
     try:
         drawn = []
         for _ in range(2):
-            use_control(page, "Draw a direction")
+            use_control(page, "New random direction")
             drawn.append(page.session.direction)
         assert not torch.equal(*drawn)
         use_control(page, "Direction", "−2")

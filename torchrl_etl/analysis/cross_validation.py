@@ -60,14 +60,14 @@ def held_out_rows(rows: int, folds: int = 5, trials: ArrayLike | None = None) ->
         return np.array_split(np.arange(rows), min(folds, rows))
     trials = np.asarray(trials)
     if trials.shape != (rows,):
-        raise ValueError(f"{len(trials)} trials came for {rows} rows; pass one for each row.")
-    # NaN, which differs from itself, is no trial, nor is None.
+        raise ValueError(f"There are {len(trials)} trials for {rows} rows; pass one for each row.")
+    # NaN differs from itself.
     if missing := [i for i, one in enumerate(trials.tolist()) if one is None or one != one]:
-        raise ValueError(f"Row {missing[0]} has no trial; name it, or leave the row out.")
+        raise ValueError(f"Row {missing[0]} has no trial; give it one, or leave the row out.")
     names, sizes = np.unique(trials, return_counts=True)
     if len(names) < 2:
         raise ValueError(
-            f"All rows are of trial {names[0]}, so none can be held out; pass no trials."
+            f"All rows belong to trial {names[0]}, so no trial can be held out; leave trials out."
         )
     # Greedy: the longest trial first, each into the currently smallest fold.
     parts: list[list] = [[] for _ in range(min(folds, len(names)))]

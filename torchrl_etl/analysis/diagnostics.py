@@ -107,7 +107,7 @@ def direction_alignment(embedding: Tensor | ArrayLike, direction: Tensor | Array
 _LEAST_VAF = 0.5  # of the better of model and PCA
 _BEHIND_PCA = 0.02  # by how much the model's VAF may fall below PCA's
 _LEAST_AUTHORITY = 0.2  # mean over actuators
-_CURE = "; ask for more synergies, or for those of another kind"
+_CURE = "; use more synergies, or another kind"
 _UNDERFITTED = ": it is underfitted, so train it longer or lower the weight of its KL terms"
 _CURES = {"gmvae": _UNDERFITTED, "vae": _UNDERFITTED}
 
@@ -128,22 +128,22 @@ def synergy_warnings(
         []
         >>> for line in synergy_warnings(vaf=0.9, pca_vaf=0.85, authority=[0.004, 0.1]):
         ...     print(line)
-        The synergies move an actuator over 5% of its range on average (20% is the least
-        advised; 1 of 2 actuators move less than 1%): learn on them only with a residual, or fit
-        them to actions that vary more.
+        The synergies move an actuator over 5% of its range on average (at least 20% is
+        advised; 1 of 2 actuators move less than 1%); learn with a residual, or fit the synergies
+        to actions that vary more.
     """
     found, name = [], kind.upper()
     if max(vaf, pca_vaf) < _LEAST_VAF:
         found.append(
-            f"The actions hardly have synergies: the {name} accounts for {vaf:.0%} of their "
-            f"variance and PCA for {pca_vaf:.0%} ({_LEAST_VAF:.0%} is the least advised); fit on "
-            "the policy's mean actions or on muscle activations instead of sampled actions, or "
-            "raise the number of synergies."
+            f"The synergies explain little of the actions' variance: {vaf:.0%} by the {name} and "
+            f"{pca_vaf:.0%} by PCA (at least {_LEAST_VAF:.0%} is advised); fit them to the "
+            "policy's mean actions or to muscle activations instead of sampled actions, or raise "
+            "the number of synergies."
         )
     if vaf < pca_vaf - _BEHIND_PCA:
         found.append(
-            f"The {name} accounts for {vaf:.1%} of the actions' variance, less than PCA's "
-            f"{pca_vaf:.1%} with as many dimensions{_CURES.get(kind, _CURE)}."
+            f"The {name} accounts for {vaf:.1%} of the actions' variance, less than PCA with the "
+            f"same number of dimensions ({pca_vaf:.1%}){_CURES.get(kind, _CURE)}."
         )
     authority = as_array(authority)
     if authority.mean() < _LEAST_AUTHORITY:
@@ -151,8 +151,8 @@ def synergy_warnings(
         idle = f"; {still} of {authority.size} actuators move less than 1%" if still else ""
         found.append(
             f"The synergies move an actuator over {authority.mean():.0%} of its range on average "
-            f"({_LEAST_AUTHORITY:.0%} is the least advised{idle}): learn on them only with a "
-            "residual, or fit them to actions that vary more."
+            f"(at least {_LEAST_AUTHORITY:.0%} is advised{idle}); learn with a residual, or fit "
+            "the synergies to actions that vary more."
         )
     return found
 

@@ -57,8 +57,8 @@ def joint_effects(activations: Tensor | ArrayLike, torques: Tensor | ArrayLike) 
     activations, torques = as_matrix(activations, "activations"), as_matrix(torques, "torques")
     if activations.shape[1] != torques.shape[1]:
         raise ValueError(
-            f"There are activations of {activations.shape[1]} muscles and torques of "
-            f"{torques.shape[1]}; both must be of the same body."
+            f"activations has {activations.shape[1]} muscles and torques has {torques.shape[1]}; "
+            "pass those of the same body."
         )
     sizes = np.linalg.norm(torques, axis=1, keepdims=True)
     if not sizes.all():

@@ -140,7 +140,7 @@ def synergy_heatmap(
     count, muscles = effects.shape
     if len(names) != muscles:
         raise ValueError(
-            f"{len(names)} names came for {muscles} actuators; pass one per actuator, in order."
+            f"There are {len(names)} names for {muscles} actuators; pass one for each, in order."
         )
     # A minimum keeps the rounding noise of a constant decoder from filling the colour scale.
     limit = max(1.0, float(np.abs(effects).max()))
@@ -266,7 +266,7 @@ def _curve(rows: Rows, column: str, unit: float) -> tuple[np.ndarray, ...] | Non
     if start > stop:
         raise ValueError(
             f"The seeds {', '.join(seeds)} have no frames in common: one ends at {stop:g} before "
-            f"another starts at {start:g}; pass them as runs of their own."
+            f"another starts at {start:g}; pass them as separate runs."
         )
     frames = frames[(frames >= start) & (frames <= stop)]
     values = np.stack([np.interp(frames, *line) for line in lines])

@@ -30,13 +30,13 @@ from torchrl_etl.io import write_atomically
 __all__ = ["write_report"]
 
 HOW_TO_READ = """\
-How to read the tables. A run counts with its last evaluation up to 1 % past the budget, since it \
-ends with a whole batch; nothing is interpolated. `mean` and the range are over seeds. `IQM` is \
-the interquartile mean (of three seeds or fewer: the mean) with the percentile bootstrap's 95 % \
-interval, seeds resampled within each task (rliable); of two seeds it is their range. \
-`P(> {control})` is the probability that a run beats a run of {control}, a tie counting one half. \
-`frames to {control}'s`: where the mean over seeds first is what {control} has at the end. \
-One seed says nothing about spread and gets no interval. `solved` is the share of episodes, \
+How to read the tables. A run is represented by its last evaluation up to 1 % past the budget, \
+since runs end with a whole batch; nothing is interpolated. `mean` and the range are over seeds. \
+`IQM` is the interquartile mean (for three seeds or fewer: the mean) with the 95 % interval of the \
+percentile bootstrap, seeds resampled within each task (rliable); for two seeds it is their range. \
+`P(> {control})` is the probability that a run beats a run of {control}, ties counted as half. \
+`frames to {control}'s` is when the mean over seeds first reaches the final mean of {control}. \
+One seed shows no spread, so it gets no interval. `solved` is the share of episodes, \
 `solved time` the share of steps."""
 
 
@@ -82,7 +82,7 @@ def write_report(
         found = next((c for c in comparisons if c.setting == setting), None)
         parts += ["## {} ({} goal)".format(*setting)]
         parts += _task(found, methods, control) if found else ["No run finished."]
-    parts += ["## Runs that did not end", *_unfinished(sweep)]
+    parts += ["## Runs that did not finish", *_unfinished(sweep)]
     parts += ["## What produced the numbers", *_origins(sweep)]
     write_atomically(folder / "report.md", "\n\n".join(parts) + "\n")
     return len(comparisons), len(methods)
@@ -103,18 +103,17 @@ def _methods(sweep: SweepResults, control: str) -> list[str]:
 def _header(sweep: SweepResults, arguments: Sequence[str], control: str) -> list[str]:
     command = shlex.join(["python", "recipes/report.py", *arguments])
     counts = (
-        f"{sweep.row_count} evaluations of {len(sweep.runs)} runs, of which {len(sweep.finished)} "
-        f"finished and {len(sweep.unfinished)} did not. Only finished runs are in tables and "
-        "pictures."
+        f"{sweep.row_count} evaluations of {len(sweep.runs)} runs; {len(sweep.finished)} runs "
+        f"finished and {len(sweep.unfinished)} did not. Tables and pictures show only "
+        "finished runs."
     )
     if sweep.replaced:
         counts += (
-            f" Evaluations of runs that were repeated later do not count ({sweep.replaced}): the "
-            "newest row of a run does."
+            f" {sweep.replaced} evaluations are left out, since their runs were repeated later."
         )
     never = sorted({run.method for run in sweep.unfinished} - {r.method for r in sweep.finished})
     if never:
-        counts += f" No run finished of {', '.join(never)}."
+        counts += f" No run of {', '.join(never)} finished."
     return [f"`{command}`", counts, HOW_TO_READ.format(control=control)]
 
 
@@ -126,10 +125,10 @@ def _overall(
 ) -> list[str]:
     parts = [
         "Returns are normalized per task, (x − zero)/(one − zero): zero is the mean return of the "
-        f"untrained policies, one the best published mean at the same frames, or {control}'s own "
-        "mean where nothing is published. Runs of all tasks are pooled, so a task with more seeds "
-        f"weighs more. A method is averaged over the tasks that it has; beside it stands {control} "
-        "on the same tasks.",
+        f"untrained policies, one is the best published mean at the same frames, or {control}'s "
+        "mean if nothing is published. Runs of all tasks are pooled, so a task with more seeds "
+        "weighs more. A method is averaged over the tasks that it has results for; column "
+        f"`{control} there` has {control} on the same tasks.",
     ]
     if results:
         rows = [
@@ -157,11 +156,11 @@ def _overall(
             rows.append((name, budget, zero, one, scale.source))
         else:
             rows.append((name, budget, "-", "-", f"left out: {scale}"))
-    parts.append(_table(("task", "frames", "zero", "one", "whose return is one"), rows))
+    parts.append(_table(("task", "frames", "zero", "one", "source of one"), rows))
     late = [c for c in comparisons if c.untrained_frames > 0]
     if late:
         parts.append(
-            "Without an evaluation at frame 0, so that zero is the mean of the first evaluations "
+            "No evaluation at frame 0, so zero is the mean of the first evaluations "
             "and normalized returns are too low: "
             + ", ".join("{} ({})".format(*c.setting) + f" at {c.untrained_frames:,}" for c in late)
             + "."
@@ -179,14 +178,14 @@ def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[
     notes = []
     absent = [name for name in methods if comparison.result(name) is None]
     if absent:
-        notes.append(f"Without a finished run that reached the budget: {', '.join(absent)}.")
+        notes.append(f"No finished run reached the budget: {', '.join(absent)}.")
     if len({len(result.seeds) for result in comparison.results}) > 1:
         notes.append("The methods have unequal numbers of seeds.")
     if comparison.ended_early:
         notes.append(f"Left out, ended before the budget: {_runs(comparison.ended_early)}.")
     if comparison.evaluated_early:
         notes.append(
-            "Counted with an evaluation more than 5 % before the budget: "
+            "Represented by an evaluation more than 5 % before the budget: "
             f"{_runs(comparison.evaluated_early)}."
         )
     env_id = environment_id(*comparison.setting)
@@ -239,9 +238,9 @@ def _origins(sweep: SweepResults) -> list[str]:
         _table(("machine", "runs"), [(name, str(n)) for name, n in sorted(machines.items())]),
     ]
     if len(machines) > 1:
-        parts.append("Wall times of different machines do not compare.")
+        parts.append("Wall times of different machines cannot be compared.")
     if mixed:
-        parts.append(f"Of more than one commit: {_runs(mixed)}.")
+        parts.append(f"Runs with more than one commit: {_runs(mixed)}.")
     if versions:
         rows = [(*pair, str(count)) for pair, count in sorted(versions.items())]
         parts.append(_table(("package", "version", "runs"), rows))

@@ -176,7 +176,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
             if run.finished and not math.isfinite(row.mean_return):
                 raise ValueError(
                     f"{path}, line {row.line}: {run} is finished but this evaluation has no finite "
-                    "return; mend the row, or give the run's last row another status."
+                    "return; fix the row, or give the run's last row another status."
                 )
     evaluations = sum(math.isfinite(row.mean_return) for row in rows)
     return SweepResults(runs, evaluations, len(rows) - kept)
@@ -201,8 +201,8 @@ def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> SweepRow:
     where = f"{path}, line {line}"
     if None in cells or None in cells.values():
         raise ValueError(
-            f"{where}: the number of cells is not that of the header; complete the line or "
-            "delete it (a writer that was killed leaves half a line)."
+            f"{where}: the line does not have as many cells as the header; complete or delete it "
+            "(a writer that was killed leaves half a line)."
         )
     text = {name: cells[name].strip() for name in COLUMNS}
     for name in ("task", "method", "status"):
@@ -217,13 +217,13 @@ def _number(where: str, name: str, text: str) -> float:
     try:
         return float(text) if text else math.nan
     except ValueError as error:
-        raise ValueError(f"{where}: {name} is {text!r}, which is not a number.") from error
+        raise ValueError(f"{where}: {name} is {text!r}; it must be a number.") from error
 
 
 def _integer(where: str, name: str, text: str) -> int:
     value = _number(where, name, text)
     if not (math.isfinite(value) and value >= 0 and value == int(value)):
-        raise ValueError(f"{where}: {name} is {text!r}; it must be a whole number from 0 up.")
+        raise ValueError(f"{where}: {name} is {text!r}; it must be a whole number, 0 or more.")
     return int(value)
 
 
@@ -238,9 +238,9 @@ def _versions(where: str, name: str, text: str) -> Mapping[str, str]:
     try:
         versions = json.loads(text or "{}")
     except json.JSONDecodeError as error:
-        raise ValueError(f"{where}: {name} is not a JSON text ({error}).") from error
+        raise ValueError(f"{where}: {name} is not valid JSON ({error}).") from error
     if not isinstance(versions, dict):
-        raise ValueError(f"{where}: {name} must be a JSON object of names and versions.")
+        raise ValueError(f"{where}: {name} must be a JSON object that maps names to versions.")
     return {str(name): str(version) for name, version in versions.items()}
 
 

@@ -111,7 +111,7 @@ def compare(
         ValueError: if there are no runs, or they are from several tasks.
     """
     if len({run.setting for run in runs}) != 1:
-        raise ValueError("Compare the finished runs of one task and goal; pass no others.")
+        raise ValueError("The runs must be of one task and goal; pass at least one, and no others.")
     budget = common_budget(runs) if frames is None else frames
     fair = [
         run
@@ -161,7 +161,10 @@ def normalize(comparison: Comparison, control: str) -> Scale | str:
     elif (baseline := comparison.result(control)) is not None:
         one, source = float(baseline.returns.mean()), f"{control}, mean here"
     else:
-        return f"nothing is published at {comparison.budget:,} frames and {control} lacks the task"
+        return (
+            f"nothing is published at {comparison.budget:,} frames and {control} has no run on "
+            "this task"
+        )
     if one <= zero:
         return f"the reference ({source}: {one:.4g}) is not above the untrained {zero:.4g}"
     return Scale(zero, one, source)

@@ -122,8 +122,8 @@ def nmf_vaf(
     shifted = actions - as_array(low)
     if shifted.min() < -1e-4:
         raise ValueError(
-            f"An action lies {-shifted.min():.3g} below the lower bound; pass the bound of these "
-            "actions' own spec as low."
+            f"An action is {-shifted.min():.3g} below the lower bound; pass the lower bound of the "
+            "actions' spec as low."
         )
     shifted = shifted.clip(min=0.0) / (shifted.max() or 1.0)
     model = make_nmf(num_synergies)

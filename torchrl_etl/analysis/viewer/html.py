@@ -43,7 +43,7 @@ def driven_list(muscles: Sequence[tuple[str, float]]) -> str:
         True
     """
     if not muscles:
-        return _BOX.format("It drives no muscle.")
+        return _BOX.format("It moves no muscle.")
     rows = [_bar(name, strength) for name, strength in muscles]
     first, others = rows[:_MOST_MUSCLES], rows[_MOST_MUSCLES:]
     more = f"<details><summary>{len(others)} more</summary>{''.join(others)}</details>"

@@ -39,7 +39,7 @@ def check_port(host: str, port: int) -> None:
     if not isinstance(host, str) or not host:  # an empty host would listen on all interfaces
         raise ValueError(
             f"host is {host!r}; it must be an address to listen on, such as 127.0.0.1 (for this "
-            "machine alone) or 0.0.0.0 (for whoever reaches it)."
+            "machine alone) or 0.0.0.0 (for any machine that can reach it)."
         )
     if not isinstance(port, int) or isinstance(port, bool) or not 0 <= port <= 65535:
         raise ValueError(
@@ -52,8 +52,8 @@ def check_port(host: str, port: int) -> None:
             probe.bind((host, port))
         except OSError as error:
             raise ValueError(
-                f"Nothing can listen on host={host} port={port} ({error.strerror}); pass another "
-                "port, or port=0 for any that is free."
+                f"The viewer cannot listen on host={host} port={port} ({error.strerror}); pass "
+                "another port, or port=0 for any free one."
             ) from error
 
 
@@ -164,13 +164,15 @@ class Page:
 
     def _stop_for(self, error: Exception) -> None:
         self.session.playing, self._dirty = False, True
-        self._controls["message"].content = f"**{error}** Reset goes on."
+        self._controls["message"].content = f"**{error}** Press Reset to continue."
         self._say(f"Error: {error}")
 
     def _browser_left(self) -> None:
         if not self.server.get_clients():
             self.session.playing = False
-            self._say(f"The browser was closed; {self.address} is still there, Ctrl-C ends it.")
+            self._say(
+                f"The browser was closed; the viewer still runs at {self.address} (Ctrl-C to stop)."
+            )
 
     # Controls -----------------------------------------------------------------------------------
 
@@ -195,7 +197,7 @@ class Page:
             goal = gui.add_dropdown("Goal", goals, initial_value=session.goal)
             add["goal"] = self._when(goal, self._choose_goal)
         if session.has_residual:
-            residual = gui.add_checkbox("Residual", True, hint="Muscles moved beside the synergies")
+            residual = gui.add_checkbox("Residual", True, hint="Also move muscles directly")
             self._when(residual, partial(setattr, session, "residual"))
         if session.root is not None and session.subject.decoder is not None:
             hold = gui.add_checkbox("Hold the body", True, hint="While the sliders move it")
@@ -217,10 +219,10 @@ class Page:
             self.session.follow(axes[name] if name in axes else torch.randn(size))
             direction.value = name
 
-        hint = "Along which stage 1's policy explores"
+        hint = "The direction in which stage 1's policy explores"
         direction = self._when(gui.add_dropdown("Direction", [*axes, "random"], hint=hint), choose)
         # A menu only reports changes, so choosing "random" again would draw nothing.
-        self._when(gui.add_button("Draw a direction"), lambda _: choose("random"))
+        self._when(gui.add_button("New random direction"), lambda _: choose("random"))
 
     def _add_synergies(self) -> None:
         gui, session = self.server.gui, self.session
@@ -228,7 +230,7 @@ class Page:
         panel = gui.add_panel()
         with panel.add_tab("Synergies", viser.Icon.ADJUSTMENTS):
             gui.add_image(_heat_map(session), label="Actuators that each synergy moves")
-            self._when(gui.add_button("All to 0"), lambda _: session.center())
+            self._when(gui.add_button("Set all to 0"), lambda _: session.center())
             for number, muscles in enumerate(driven_muscles(decoder, names)):
                 slider = gui.add_slider(
                     f"{number + 1}", min=-1.0, max=1.0, step=0.01, initial_value=0.0

@@ -110,8 +110,8 @@ class Session:
     def __init__(self, subject: Subject) -> None:
         if not subject.drivers:
             raise ValueError(
-                f"{subject.name} holds neither a policy nor synergies, so nothing would move; name "
-                "a run that has begun to learn or has explored, or a synergy bundle."
+                f"{subject.name} has neither a policy nor synergies, so nothing would move; pass a "
+                "run that has begun to learn or has explored, or a synergy bundle."
             )
         self.subject = subject
         self.driver: Driver = subject.drivers[0]
@@ -169,8 +169,8 @@ class Session:
         direction = torch.as_tensor(direction, dtype=torch.float32)
         if direction.shape != self.direction.shape or not direction.any():
             raise ValueError(
-                f"The direction is {direction.tolist()}; it must be {len(self.direction)} numbers "
-                "that are not all zero."
+                f"The direction is {direction.tolist()}; it must be {len(self.direction)} numbers, "
+                "not all zero."
             )
         self.drive("explorer")
         self.direction = torch.nn.functional.normalize(direction, dim=0)
