@@ -42,7 +42,7 @@ def test_indices_of_groups() -> None:
 
 @pytest.mark.parametrize("wrong", [[0, 2], [1, 1], [], [[0, 1]], [0.0, 1.0], [-1, 0]])
 def test_groups_not_numbered_consecutively_are_refused(wrong: list) -> None:
-    with pytest.raises(ValueError, match="every number from 0 to the largest"):
+    with pytest.raises(ValueError, match="every index from 0 to the largest"):
         MuscleGroups.of(wrong)
 
 
@@ -243,8 +243,8 @@ def test_deviations_get_no_gradient_at_amplitude_zero() -> None:
 @pytest.mark.parametrize(
     ("groups", "options", "message"),
     [
-        ([0, 1, 0], {}, "groups are of 3 muscles but the action has 6"),
-        ([0, 1, 0, 3, 1, 0], {}, "every number from 0 to the largest"),
+        ([0, 1, 0], {}, "groups has 3 muscles but the action has 6"),
+        ([0, 1, 0, 3, 1, 0], {}, "every index from 0 to the largest"),
         (GROUPS, {"slope": -1.0}, "slope is -1"),
         (GROUPS, {"ceiling": 0.2}, "ceiling is 0.2"),
     ],

@@ -50,8 +50,8 @@ class MuscleGroups(NamedTuple):
         count = int(group.max()) + 1 if group.numel() else 0
         if group.ndim != 1 or group.is_floating_point() or set(group.tolist()) != {*range(count)}:
             raise ValueError(
-                f"groups is {group.tolist()}; it must give each muscle the number of its group, "
-                "with every number from 0 to the largest in use."
+                f"groups is {group.tolist()}; it must hold the index of each muscle's group, and "
+                "use every index from 0 to the largest."
             )
         first = torch.tensor([group.tolist().index(number) for number in range(count)])
         others = torch.ones_like(group).index_fill(0, first, 0)
@@ -271,8 +271,8 @@ def make_dynsyn_actor(
     n = action_spec.shape[-1]
     if groups.num_muscles != n:
         raise ValueError(
-            f"groups are of {groups.num_muscles} muscles but the action has {n}; use groups that "
-            "were found on this body."
+            f"groups has {groups.num_muscles} muscles but the action has {n}; use groups that were "
+            "found on this body."
         )
     check_real(f"[0, {_DEVIATION}]", ceiling=ceiling)
     check_real("[0, inf)", slope=slope)

@@ -288,7 +288,9 @@ def make_lattice_actor(
             "must satisfy low < high and low <= log_std_init <= high."
         )
     if not hidden:
-        raise ValueError("hidden is empty; Lattice perturbs a last hidden layer, so give one.")
+        raise ValueError(
+            "hidden is empty; Lattice perturbs the last hidden layer, so pass at least one size."
+        )
     check_real("[0, inf)", alpha=alpha, std_reg=std_reg)
     n = action_spec.shape[-1]
     layers = make_layers(sum(inputs.values()), n, body, hidden, layer_norm)

@@ -74,12 +74,12 @@ class LatticeNoise(TensorDictModuleBase):
         network = getattr(actor[0], "module", None)
         if not isinstance(network, LatticeNetwork):
             raise TypeError(
-                f"The actor computes with a {type(network).__name__}; pass one of "
+                f"The actor's network is a {type(network).__name__}; pass an actor from "
                 "make_lattice_actor(..., state_dependent=True)."
             )
         if not isinstance(network.spread, StateDependentSpread):
             raise TypeError(
-                "The actor's noise does not depend on the state; pass one of "
+                "The actor's noise does not depend on the state; pass an actor from "
                 "make_lattice_actor(..., state_dependent=True)."
             )
         super().__init__()

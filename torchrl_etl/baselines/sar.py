@@ -253,8 +253,8 @@ def best_episodes(
 def _check_blend(blend: float) -> None:
     if not 0.0 < blend <= 1.0:
         raise ValueError(
-            f"blend is {blend}; it is the share of the synergies in an action and must lie in "
-            "(0, 1]: the paper's are 0.66 for hands and 1 for legs."
+            f"blend is {blend}; it must be in (0, 1], the share of the synergies in an action (in "
+            "the paper 0.66 for hands and 1 for legs)."
         )
 
 
@@ -275,6 +275,6 @@ def _varying(actions: Tensor, num_synergies: int, low: Any, high: Any) -> Tensor
     if varying < num_synergies:
         raise ValueError(
             f"{len(actions)} actions that vary in {varying} dimensions are too few for "
-            f"{num_synergies} synergies; collect more, or ask for fewer."
+            f"{num_synergies} synergies; collect more actions, or use fewer synergies."
         )
     return actions
