@@ -94,7 +94,7 @@ def test_unresponsive_worker_ends_the_run(start):
     next(batches)
     collector.timeout = 3.0
     os.kill(collector.jobs[0].pid, signal.SIGSTOP)
-    with pytest.raises(RuntimeError, match="worker 0 gave no batch in 3 s"):
+    with pytest.raises(RuntimeError, match="worker 0 sent no batch within 3 s"):
         for _ in range(10_000):
             next(batches)
 
@@ -106,7 +106,7 @@ def test_worker_that_stops_before_taking_weights_ends_the_run(start):
     collector.update_policy_weights_()
     os.kill(collector.jobs[0].pid, signal.SIGSTOP)
     began = time.monotonic()
-    with pytest.raises(RuntimeError, match="worker 0 did not take weights"):
+    with pytest.raises(RuntimeError, match="worker 0 did not receive weights"):
         next(batches)
     assert time.monotonic() - began < 45
 

@@ -182,7 +182,7 @@ def test_hanging_worker_times_out():
     batches = make_batches("process", make_stuck, actor, frames_per_batch=8)
     batches.await_start()
     batches._timeout = 3.0
-    with pytest.raises(CollectionError, match=r"did not give a batch within 3 s.*timeout"):
+    with pytest.raises(CollectionError, match=r"did not return a batch within 3 s.*timeout"):
         for _ in range(4):
             batches.next()
     processes = batches._collector.procs
@@ -266,7 +266,7 @@ def test_failed_start_raises_in_await_start_and_can_be_closed():
 
 
 def test_single_cannot_run_ahead():
-    with pytest.raises(ValueError, match="takes a second process"):
+    with pytest.raises(ValueError, match="needs another process"):
         Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)
 
 

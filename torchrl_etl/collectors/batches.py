@@ -75,8 +75,8 @@ class Batches:
     ) -> None:
         if in_process and ahead:
             raise ValueError(
-                "ahead=True collects while the learner learns, which takes a second process; use "
-                "another kind of collector."
+                "ahead=True collects while the learner learns and so needs another process; use a "
+                "collector that has one."
             )
         self._caller = None if in_process else _Caller()
         self._ahead, self._restarts, self._timeout = ahead, restarts, timeout
@@ -106,9 +106,9 @@ class Batches:
         self.await_start()
         if self._restarts:
             if self._next is not None:
-                self._wait("give a batch", self._next)
+                self._wait("return a batch", self._next)
                 self._next = None
-            self._do("take a seed", self._collector.set_seed, seed)
+            self._do("accept a seed", self._collector.set_seed, seed)
             if self._caller is None:  # set_seed has already reset workers
                 self._collector.reset()
 
@@ -119,7 +119,7 @@ class Batches:
 
     def next(self) -> TensorDictBase:
         """The next batch, with the collector's batch size."""
-        batch = self._wait("give a batch", self._next or self._request())
+        batch = self._wait("return a batch", self._next or self._request())
         self._next = self._request() if self._ahead else None
         return batch
 
@@ -148,7 +148,7 @@ class Batches:
     def _request(self) -> Future[TensorDictBase]:
         self.await_start()
         if self._caller is not None:
-            self._do("take new weights", self._collector.update_policy_weights_)
+            self._do("accept new weights", self._collector.update_policy_weights_)
         return self._call(next, self._iterator)
 
     def _do(self, what: str, function: Callable[..., Any], *args: Any) -> Any:
@@ -162,7 +162,7 @@ class Batches:
         return future
 
     def _wait(self, what: str, future: Future) -> Any:
-        go_on = "The run can go on from its last checkpoint: resume=FOLDER."
+        go_on = "Continue from the last checkpoint with resume=FOLDER."
         deadline = time.monotonic() + self._timeout
         while time.monotonic() < deadline:
             try:

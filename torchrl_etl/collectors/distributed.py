@@ -166,7 +166,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             self._trackers[worker] = out.irecv(src=rank, return_premature=True)
             self._asked[worker] = time.monotonic()
         except RuntimeError as error:
-            raise self._lost(worker, f"did not take weights ({error})") from error
+            raise self._lost(worker, f"did not receive weights ({error})") from error
 
     def _receive(self) -> tuple[int, TensorDictBase]:
         worker = self._wait()
@@ -188,7 +188,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
                 raise self._lost(worker, "has ended")
             for worker in busy:
                 if time.monotonic() - self._asked[worker] > self.timeout:
-                    raise self._lost(worker, f"gave no batch in {self.timeout:g} s")
+                    raise self._lost(worker, f"sent no batch within {self.timeout:g} s")
             if len(busy) < len(asked):
                 return next(worker for worker in asked if worker not in busy)
             time.sleep(pause)
@@ -239,8 +239,8 @@ def _check_launcher(launcher: str) -> None:
         raise ImportError("launcher='submitit' needs submitit: pip install 'torchrl_etl[slurm]'.")
     if torch.distributed.is_initialized():
         raise RuntimeError(
-            "DistributedWorkers needs torch's default process group for itself, and there is one "
-            "already in this process. Use RayWorkers, or destroy_process_group() first."
+            "DistributedWorkers needs torch's default process group, and this process already has "
+            "one. Use RayWorkers, or call destroy_process_group() first."
         )
 
 

@@ -169,9 +169,9 @@ class RayWorkers(RemoteWorkers, RayCollector):
         if late:
             raise RuntimeError(
                 f"RayWorkers: {len(late)} of {len(ready)} workers did not start in "
-                f"{self.timeout:g} s. Each asks for {self._recipe[1][0]}; the cluster has "
-                f"{ray.available_resources()} to spare. Ask for fewer workers or less, add "
-                "nodes, or raise timeout."
+                f"{self.timeout:g} s. Each needs {self._recipe[1][0]}; the cluster has "
+                f"{ray.available_resources()} free. Use fewer or smaller workers, add nodes, or "
+                "raise timeout."
             )
 
     def _get(self, future: Any, worker: int) -> Any:
@@ -225,7 +225,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         for future in busy:
             if time.monotonic() - self._pending[future][2] >= self.timeout:
                 worker = self._pending.pop(future)[0]
-                self._replace(worker, f"gave no batch in {self.timeout:g} s")
+                self._replace(worker, f"sent no batch within {self.timeout:g} s")
 
     def _replace(self, worker: int, cause: str, error: Exception | None = None) -> None:
         import ray
@@ -233,7 +233,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         ray.kill(self._remote_collectors[worker])
         lost = self.started - self.num_workers
         if lost >= self.replacements:
-            raise self._lost(worker, f"{cause}; {lost} were replaced before it") from error
+            raise self._lost(worker, f"{cause}; {lost} were already replaced") from error
         self._remote_collectors[worker] = self._start(worker)
         self._request(worker)
 

@@ -141,8 +141,8 @@ class RemoteWorkers:
         advice = ""
         if self.collected_frames:
             advice = (
-                f" The {self.collected_frames} frames delivered so far were counted once; go on "
-                "from the last checkpoint: resume=FOLDER."
+                f" The {self.collected_frames} frames delivered so far were counted once; continue "
+                "from the last checkpoint with resume=FOLDER."
             )
         return RuntimeError(f"{type(self).__name__}: worker {worker} {cause}.{advice}")
 
@@ -216,14 +216,14 @@ def check_arguments(
         )
     if not isinstance(policy, TensorDictModuleBase):
         raise TypeError(
-            f"policy is a {type(policy).__name__}; its weights travel by their names, so it "
-            "must be a TensorDictModule such as TensorDictSequential(actor, decoder)."
+            f"policy is a {type(policy).__name__}; its weights are sent by name, so it must be a "
+            "TensorDictModule such as TensorDictSequential(actor, decoder)."
         )
     check_integer(1, num_workers=num_workers, frames_per_batch=frames_per_batch)
     if sync and frames_per_batch % num_workers:
         raise ValueError(
-            f"frames_per_batch={frames_per_batch} cannot be shared equally by "
-            f"num_workers={num_workers}; a multiple of it near by is "
+            f"frames_per_batch is {frames_per_batch}; it must be a multiple of "
+            f"num_workers={num_workers}, such as "
             f"{num_workers * max(1, round(frames_per_batch / num_workers))}."
         )
     check_real("(0, inf)", timeout=timeout)
@@ -235,4 +235,6 @@ def check_arguments(
         )
     managed = sorted(MANAGED & set(collector_kwargs))
     if managed:
-        raise ValueError(f"collector_kwargs may not hold {', '.join(managed)}: set by the workers.")
+        raise ValueError(
+            f"collector_kwargs has {', '.join(managed)}, which the workers set; leave them out."
+        )

@@ -109,9 +109,9 @@ class VectorCollector(Collector):
         foreign = sorted(kind.__name__ for kind in self._policy_on_arrays.foreign)
         if foreign and not isinstance(self._wrapped_policy, RandomPolicy):
             warnings.warn(
-                f"The policy is called with a tensordict at each step, which takes longer than a "
-                f"traced graph, since a graph may miss what {', '.join(foreign)} does (hooks, "
-                "branches, counts, log-probabilities).",
+                f"The policy is called with a tensordict at each step, which is slower than a "
+                f"traced graph: a graph may miss what {', '.join(foreign)} does (hooks, branches, "
+                "counts, log-probabilities).",
                 stacklevel=3,
             )
 
@@ -243,9 +243,9 @@ def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[Transform]]:
     if foreign or not isinstance(env, GymWrapper) or not isinstance(env._env, SyncVectorEnv):
         what = type(foreign[0]).__name__ if foreign else f"{type(env).__name__} of one simulator"
         raise ValueError(
-            "VectorCollector knows make_env(..., num_envs=2 or more) under "
-            f"{', '.join(kind.__name__ for kind in _KNOWN)} and transforms with array_step and "
-            f"array_reset, but the environment has a {what}; use "
+            "VectorCollector supports make_env(..., num_envs=2 or more) with "
+            f"{', '.join(kind.__name__ for kind in _KNOWN)} and transforms that have array_step "
+            f"and array_reset, but the environment has a {what}; use "
             "torchrl.collectors.Collector for it."
         )
     return env._env, transforms
