@@ -47,7 +47,7 @@ def test_fewer_synergies_are_those_of_the_largest_torques():
     torques = np.array([[1.0, 1.0, 0.0], [5.0, 5.0, 0.0], [0.0, 0.0, 9.0]])
     (change,) = muscle_changes(torques, 1)
     assert np.abs(change) == pytest.approx([1.0, 1.0, 0.0])
-    with pytest.raises(ValueError, match="num_synergies is 4, but muscles turn 3 joints"):
+    with pytest.raises(ValueError, match="num_synergies is 4 but muscles turn only 3 joints"):
         muscle_changes(torques, 4)
 
 
@@ -64,7 +64,7 @@ def test_body_decoder_rests_at_the_given_excitation_and_moves_joints():
     assert torch.allclose(slope.mT, torch.from_numpy(changes).float(), atol=1e-4)
     near = excitation(env, decoder.module(0.05 * torch.randn(500, len(changes)))).detach()
     assert joint_effects(near, torques).share > 0.99
-    with pytest.raises(ValueError, match="no action inside the bounds makes that"):
+    with pytest.raises(ValueError, match="an excitation that actions inside the bounds reach"):
         body_decoder(env, changes, rest=0.95)
 
 

@@ -189,7 +189,7 @@ def test_batched_reset_takes_a_tensordict_without_mask():
 def test_actuator_names_of_torchrls_dm_control_env_but_not_of_workers():
     reacher = DMControlEnv("reacher", "easy")
     assert actuator_names(reacher) == ["shoulder", "wrist"]
-    with pytest.raises(ValueError, match="A SerialEnv has its simulators in workers; pass the"):
+    with pytest.raises(ValueError, match="A SerialEnv runs its simulators in workers; pass the"):
         actuator_names(SerialEnv(2, lambda: reacher))
 
 

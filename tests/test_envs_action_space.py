@@ -68,7 +68,7 @@ def test_actions_of_any_shape_are_flat_actuators(shape, num_envs):
         (spaces.MultiBinary(3), "action space MultiBinary"),
         (spaces.Dict(arm=spaces.Box(-1, 1, (2,))), "action space Dict"),
         (spaces.Tuple([spaces.Box(-1, 1, (2,))]), "action space Tuple"),
-        (spaces.Box(0, 5, (2,), np.int64), "actions are a Box of real numbers"),
+        (spaces.Box(0, 5, (2,), np.int64), "a task with a Box of real numbers"),
     ],
 )
 def test_unusable_action_spaces_are_refused_in_one_sentence(space, words):

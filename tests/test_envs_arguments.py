@@ -37,7 +37,7 @@ def test_arguments_of_gymnasium_are_accepted():
 
 
 def test_ignored_argument_is_refused_with_the_nearest_known_name():
-    with pytest.raises(ValueError, match=r"ignores env_kwargs\.stifness.*they know stiffness"):
+    with pytest.raises(ValueError, match=r"ignores env_kwargs\.stifness.*they read stiffness"):
         make_env(FORGIVING, env_kwargs={"stifness": 0.5})
 
 

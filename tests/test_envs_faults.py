@@ -28,7 +28,7 @@ def test_non_finite_numbers_stop_the_run_and_say_where(fault, words, num_envs):
 def test_observation_of_the_wrong_shape_is_a_simulation_error(num_envs, monkeypatch):
     monkeypatch.setattr(Planted, "reset", lambda self, **_: (np.zeros(2), {}))
     monkeypatch.setattr(Planted, "count", 0, raising=False)
-    words = r"observation has shape \(2,\) and not its space's \(3,\) at step 0 of episode 1"
+    words = r"observation has shape \(2,\) but its space has \(3,\) at step 0 of episode 1"
     with pytest.raises(SimulationError, match=words):
         make_env(PLANTED, num_envs=num_envs).reset(seed=0)
 

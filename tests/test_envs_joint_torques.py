@@ -91,7 +91,7 @@ def test_bodies_with_other_actuators_than_muscles_are_refused():
         '<motor name="slider" tendon="slider"/>',
     )
     with pytest.raises(
-        ValueError, match="has 3 actuators, 2 of them muscles, and actions of 3 entries"
+        ValueError, match="has 3 actuators, 2 of them muscles, and actions with 3 entries"
     ):
         joint_torques(Body(motors))
     with pytest.raises(ValueError, match="MuJoCo"):
@@ -146,5 +146,5 @@ def test_custom_body_with_undefined_excitation_is_refused(body, flag):
         lambda: excitation(env, torch.zeros(3)),
         lambda: NamedObservation(body, activations=True),
     ):
-        with pytest.raises(ValueError, match="Body takes actions below 0 and does not say how"):
+        with pytest.raises(ValueError, match="Body has actions below 0 and does not define how"):
             asked()

@@ -116,7 +116,7 @@ def test_goal_is_read_from_the_id(name, goal):
 
 
 def test_goal_that_contradicts_the_id_is_refused():
-    with pytest.raises(ValueError, match="names its random goal itself"):
+    with pytest.raises(ValueError, match="already has the random goal"):
         resolve_task("myoElbowPose1D6MRandom-v0", "fixed")
 
 

@@ -56,7 +56,7 @@ def test_random_goal_of_a_task_without_one_names_those_that_have_it():
 
 
 def test_goal_that_contradicts_the_id_is_refused():
-    with pytest.raises(ValueError, match="leave goal out, or name the task 'myoHandPose'"):
+    with pytest.raises(ValueError, match="leave goal out, or pass the task 'myoHandPose'"):
         resolve_task("myoHandPoseRandom-v0", "fixed")
 
 

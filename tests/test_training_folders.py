@@ -212,7 +212,7 @@ def test_restart_seed_resumes_past_a_diverging_simulation(tmp_path, monkeypatch)
     deadly.add(seeds[-1])  # of episodes begun after the checkpoint at frame 320
 
     run = tmp_path / "run"
-    with pytest.raises(SimulationError, match="go on with resume=RUN restart_seed=1"):
+    with pytest.raises(SimulationError, match="continue with resume=RUN restart_seed=1"):
         Experiment(tiny(f"run_dir='{run}'", *control)).run()
     with pytest.raises(SimulationError):
         resume(run)

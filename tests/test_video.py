@@ -209,7 +209,7 @@ def test_video_of_a_task_without_mujoco_is_refused(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MUJOCO_GL", "egl")
     assert command("evaluate.py", "zoo=overactuated", "episodes=1", "video=true") != 0
-    assert "does not run on MuJoCo, whose bodies are drawn" in capsys.readouterr().err
+    assert "does not run on MuJoCo, which is needed to draw" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -29,8 +29,8 @@ def check_action_space(space: spaces.Space, task: str) -> None:
     """
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
         raise ValueError(
-            f"{task} has the action space {space}; a synergy is a direction among "
-            "continuous actuators, so choose a task whose actions are a Box of real numbers."
+            f"{task} has the action space {space}; synergies need continuous actuators, so choose "
+            "a task with a Box of real numbers as action space."
         )
     low, high = space.low.ravel(), space.high.ravel()
     if low.size == 0:

@@ -76,7 +76,7 @@ class AnalyticOveractuated(gym.Env):
     ):
         if not 1 <= num_joints <= num_muscles:
             raise ValueError(
-                f"num_joints must be between 1 and num_muscles={num_muscles}, got {num_joints}."
+                f"num_joints is {num_joints}; it must be from 1 to num_muscles={num_muscles}."
             )
         check_choice("goal", goal, ("fixed", "random"))
         rng = np.random.default_rng(matrix_seed)

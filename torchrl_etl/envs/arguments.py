@@ -22,8 +22,8 @@ def argument_errors(name: str, env_kwargs: Mapping[str, Any]) -> Iterator[None]:
         if not env_kwargs:
             raise
         raise ValueError(
-            f"{name} does not take env_kwargs={dict(env_kwargs)} ({error}); use names and types "
-            "that its own constructor knows."
+            f"{name} does not take env_kwargs={dict(env_kwargs)} ({error}); use the arguments of "
+            "its own constructor."
         ) from error
 
 
@@ -47,5 +47,5 @@ def check_known(env: gym.Env, name: str, env_kwargs: Mapping[str, Any]) -> None:
             near = difflib.get_close_matches(key, known) or sorted(known)
             raise ValueError(
                 f"{name} ignores env_kwargs.{key}, since no constructor of its simulator reads it; "
-                f"they know {', '.join(near)}."
+                f"they read {', '.join(near)}."
             )

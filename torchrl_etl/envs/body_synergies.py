@@ -78,8 +78,8 @@ def muscle_changes(torques: np.ndarray, num_synergies: int | None = None) -> np.
         check_integer(1, num_synergies=num_synergies)
         if num_synergies > joints:
             raise ValueError(
-                f"num_synergies is {num_synergies}, but muscles turn {joints} joints; give 1 to "
-                f"{joints}, or leave it out for one each."
+                f"num_synergies is {num_synergies} but muscles turn only {joints} joints; pass 1 "
+                f"to {joints}, or leave it out for one per joint."
             )
     unit = torques / np.linalg.norm(torques, axis=1, keepdims=True)
     inverse = np.linalg.pinv(unit, rcond=WEAKEST).T
@@ -101,7 +101,9 @@ def _action_of(env: EnvBase, rest: float, low: Tensor, high: Tensor) -> tuple[Te
     """The action [n] whose excitation is ``rest``, and the slope of excitation there [n]."""
     low, high = low.clone().double(), high.clone().double()
     if not ((excitation(env, low) < rest) & (rest < excitation(env, high))).all():
-        raise ValueError(f"rest is {rest}, and no action inside the bounds makes that.")
+        raise ValueError(
+            f"rest is {rest}; it must be an excitation that actions inside the bounds reach."
+        )
     for _ in range(60):  # bisection: excitation is increasing
         middle = (low + high) / 2
         below = excitation(env, middle) < rest

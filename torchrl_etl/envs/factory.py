@@ -113,7 +113,7 @@ def make_env(
     if action_repeat > (steps := task.episode_steps or action_repeat):
         raise ValueError(
             f"action_repeat is {action_repeat}, but an episode of {task.name} has {steps} steps; "
-            "an action may last as long as that at most."
+            "it must not be more than that."
         )
     build = partial(
         _build,

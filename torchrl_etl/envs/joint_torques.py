@@ -51,7 +51,7 @@ def joint_torques(
         >>> torques.matrix.shape  # 23 joints, 39 muscles
         (23, 39)
     """
-    model, now = muscle_state(env, "A torque on each joint per muscle, as of synergies=body,")
+    model, now = muscle_state(env, "The torque of each muscle, as for synergies=body,")
     import mujoco  # installed, since the model exists
 
     data, generator = mujoco.MjData(model), np.random.default_rng(seed)

@@ -33,10 +33,10 @@ def muscle_state(env: EnvBase | gym.Env, asked_by: str) -> tuple[Any, Any]:
         size = math.prod(inner.action_space.shape)
         if muscles == model.nu == size:
             return model, data
-        found = f"{model.nu} actuators, {muscles} of them muscles, and actions of {size} entries"
+        found = f"{model.nu} actuators, {muscles} of them muscles, and actions with {size} entries"
     raise ValueError(
-        f"{asked_by} needs an environment with MuJoCo's model and data, each of whose actuators is "
-        f"a muscle and an entry of the action; {type(inner).__name__} has {found}."
+        f"{asked_by} needs a MuJoCo environment in which every actuator is a muscle with its own "
+        f"action entry; {type(inner).__name__} has {found}."
     )
 
 
@@ -52,7 +52,7 @@ def sends_sigmoid(env: EnvBase | gym.Env, low: Array, high: Array) -> bool:
     if getattr(inner, "normalize_act", False) and (low == -1).all() and (high == 1).all():
         return True
     raise ValueError(
-        f"{type(inner).__name__} takes actions below 0 and does not say how they excite its "
-        "muscles; let them be excitations, in [0, 1], or be in [-1, 1] with an attribute "
-        "normalize_act that is True, for MyoSuite's sigmoid."
+        f"{type(inner).__name__} has actions below 0 and does not define how they excite muscles; "
+        "use excitations in [0, 1], or actions in [-1, 1] with the attribute normalize_act=True "
+        "for MyoSuite's sigmoid."
     )

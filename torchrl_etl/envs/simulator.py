@@ -29,13 +29,13 @@ def simulator(env: EnvBase | gym.Env | gym.vector.VectorEnv) -> Any:
             return env._env
         elif isinstance(env, BatchedEnvBase):
             raise ValueError(
-                f"A {type(env).__name__} has its simulators in workers; pass the environment of "
+                f"A {type(env).__name__} runs its simulators in workers; pass the environment of "
                 "one worker."
             )
         elif hasattr(env, "base_env"):
             env = env.base_env
         else:
-            raise ValueError(f"There is no known way to the simulator of a {type(env).__name__}.")
+            raise ValueError(f"The simulator of a {type(env).__name__} cannot be reached.")
     return env.unwrapped
 
 
@@ -53,4 +53,4 @@ def mujoco_state(env: EnvBase) -> tuple[Any, Any]:
     if mujoco and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         return model, data
     name = type(inner).__name__
-    raise ValueError(f"{name} does not run on MuJoCo, whose bodies are drawn and analysed.")
+    raise ValueError(f"{name} does not run on MuJoCo, which is needed to draw or analyse bodies.")

@@ -76,7 +76,9 @@ class SynergyActionWrapper(gym.ActionWrapper, gym.utils.RecordConstructorArgs):
             )
         if isinstance(bundle, SynergyMap):
             if residual is not None:
-                raise ValueError("residual is of a bundle; a decoder that is given has its own.")
+                raise ValueError(
+                    "residual is only for a bundle's folder; this decoder has its own."
+                )
             self.decoder = bundle
             _check_decoder(bundle, box)
         else:

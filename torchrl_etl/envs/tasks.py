@@ -175,11 +175,11 @@ def resolve_task(name: str, goal: Goal | None = None) -> Task:
         >>> resolve_task("myoBaoding", goal="random")
         Traceback (most recent call last):
         ...
-        ValueError: myoBaoding has no random goal; the tasks that have both goals are myoHandPose, \
+        ValueError: myoBaoding has no random goal; the tasks with both goals are myoHandPose, \
 myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
     """
     if not isinstance(name, str):
-        raise TypeError(f"A task is named by a string, got {type(name).__name__}.")
+        raise TypeError(f"The task is a {type(name).__name__}; it must be a string.")
     if goal is not None:
         check_choice("goal", goal, get_args(Goal))
     if name in _BY_NAME:
@@ -188,8 +188,8 @@ myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
         task = _BY_ID[name]
         if goal not in (None, task.goal):
             raise ValueError(
-                f"{name} names its {task.goal} goal itself, but goal={goal!r} was asked for; "
-                f"leave goal out, or name the task {task.name!r}."
+                f"{name} already has the {task.goal} goal, but goal={goal!r} was given; leave goal "
+                f"out, or pass the task {task.name!r}."
             )
     elif _in_dm_control(name):
         task = Task(name, name, suite="dm_control", solved=False, goal=goal or "fixed")
@@ -197,7 +197,9 @@ myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
         task = _by_its_spec(name, goal)
     else:
         nearest = _nearest(name)
-        hint = f"the nearest known names are {', '.join(nearest)}" if nearest else "none is near it"
+        hint = (
+            f"the nearest known names are {', '.join(nearest)}" if nearest else "no name is close"
+        )
         raise ValueError(
             f"Unknown task {name!r}; {hint}. list_tasks() gives the paper's tasks; any "
             "registered Gymnasium id and any DMControl 'domain-task' work too, and "
@@ -205,9 +207,7 @@ myoHandKeyTurn, myoHandPenTwirl, myo2HandPose, overactuated.
         )
     if goal == "random" and "random" not in task.goals:
         both = ", ".join(t.name for t in _BY_NAME.values() if t.random_id)
-        raise ValueError(
-            f"{task.name} has no random goal; the tasks that have both goals are {both}."
-        )
+        raise ValueError(f"{task.name} has no random goal; the tasks with both goals are {both}.")
     return task
 
 
@@ -264,7 +264,7 @@ def _by_its_spec(name: str, goal: Goal | None) -> Task:
     said = next((own for own in ("fixed", "random") if own.capitalize() in env_id), None)
     if said is not None and goal not in (None, said):
         raise ValueError(
-            f"{name} names its {said} goal itself, but goal={goal!r} was asked for; leave goal out."
+            f"{name} already has the {said} goal, but goal={goal!r} was given; leave goal out."
         )
     task = Task(name, env_id, None, episode_steps=spec.max_episode_steps, goal=said or goal)
     if not str(spec.entry_point).startswith("myosuite."):

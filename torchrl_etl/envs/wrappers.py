@@ -112,14 +112,14 @@ class FiniteGuard(gym.Wrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         observation = np.asarray(observation, dtype=np.float32)
         if observation.shape != (expected := self.observation_space.shape):
-            what = f"observation has shape {observation.shape} and not its space's {expected}"
-            raise self._error(what, "let observation_space be that of what reset and step return")
+            what = f"observation has shape {observation.shape} but its space has {expected}"
+            raise self._error(what, "let observation_space match what reset and step return")
         self._check("observation", observation)
         return observation, info
 
     def step(self, action: np.ndarray):
         self._step += 1
-        self._check("action", action, "the policy sent it: look for a diverged loss or network")
+        self._check("action", action, "it is from the policy: look for a diverged loss or network")
         try:
             observation, reward, *ends_and_info = self.env.step(action)
         except self._faults as fault:
@@ -145,8 +145,8 @@ class FiniteGuard(gym.Wrapper):
     def _error(self, what: str, cure: str | None = None) -> SimulationError:
         seed = "never seeded" if self._seed is None else f"since seed {self._seed}"
         cure = cure or (
-            "if it is rare, go on with resume=RUN restart_seed=1, which collects other episodes, "
-            "otherwise make the actions smaller or smoother"
+            "if it is rare, continue with resume=RUN restart_seed=1, which collects other "
+            "episodes; otherwise make the actions smaller or smoother"
         )
         return SimulationError(
             f"{self._name}: the {what} at step {self._step} of episode {self._episode} ({seed}); "
@@ -194,11 +194,11 @@ class NamedObservation(gym.Wrapper):
         if success_key is not None:
             entries["solved"] = spaces.Box(0, 1, (1,), np.bool_)
         if activations:
-            muscle_state(env, "activations=True, as method=sar and fit.actions=activation have it,")
+            muscle_state(env, "activations=True (for method=sar or fit.actions=activation)")
             self._sigmoid = sends_sigmoid(env, env.action_space.low, env.action_space.high)
             entries["activation"] = env.action_space
         if muscle_lengths:
-            muscle_state(env, "muscle_lengths=True, as method=dep has it,")
+            muscle_state(env, "muscle_lengths=True (for method=dep)")
             shape = env.action_space.shape
             entries["muscle_length"] = spaces.Box(-np.inf, np.inf, shape, np.float32)
         self.observation_space = spaces.Dict(entries)
@@ -220,7 +220,7 @@ class NamedObservation(gym.Wrapper):
         self._sought = missing and not ended
         if missing and ended:
             warnings.warn(
-                f"success_key is {self._success_key!r}, which info had at no step of the first "
+                f"success_key is {self._success_key!r}, but info had no such entry in the first "
                 f"episode (it has {', '.join(map(str, info)) or 'nothing'}); steps without it do "
                 "not count as solved.",
                 RuntimeWarning,
