@@ -218,7 +218,7 @@ def test_actions_that_cannot_be_fitted_are_refused() -> None:
         SARDecoder.fit(actions, 4)
     with pytest.raises(ValueError, match=r"have 2 row.*at least 3 different actions"):
         SARDecoder.fit(actions[:2], 2)
-    with pytest.raises(ValueError, match=r"the bounds are \[0, 1\]; bring the actions to these"):
+    with pytest.raises(ValueError, match=r"the bounds are \[0, 1\]; scale the actions to these"):
         SARDecoder.fit(actions, 3, low=0.0, high=1.0)
     with pytest.raises(ValueError, match="NaN or infinity"):
         SARDecoder.fit(torch.where(actions > 0.3, torch.nan, actions), 3)

@@ -94,7 +94,7 @@ def actor_of(kind: type) -> ProbabilisticActor:
 
 @pytest.mark.parametrize("kind", [IndependentNormal, TruncatedNormal])
 def test_an_actor_without_a_tanh_gaussian_is_refused(kind: type):
-    with pytest.raises(ValueError, match=f"draws from {kind.__name__}; noise is held in a Tanh"):
+    with pytest.raises(ValueError, match=f"samples from {kind.__name__}; held noise needs a Tanh"):
         HeldNoise(actor_of(kind))
 
 

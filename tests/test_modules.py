@@ -336,7 +336,7 @@ def test_bfloat16_body_keeps_outputs_and_gradients_in_float32() -> None:
 
 
 def test_unequal_residual_widths_and_unknown_bodies_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"hidden is \[4, 8\].*one width"):
+    with pytest.raises(ValueError, match=r"hidden is \[4, 8\].*same width"):
         make_critic({"observation": 3}, body="residual", hidden=(4, 8))
     with pytest.raises(ValueError, match=r"body is 'resnet'.*residual"):
         make_critic({"observation": 3}, body="resnet")

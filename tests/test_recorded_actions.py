@@ -77,9 +77,9 @@ def test_integers_and_constant_columns_give_finite_numbers(use):
         (ACTIONS[:, :3], ValueError, r"shape \(64, 3\), but there are 4 actuators; pass an array"),
         (ACTIONS[:, 0], ValueError, "but there are 4 actuators"),
         (WITH_NAN, ValueError, "NaN or infinity in 2 of 64 rows, the first in row 3"),
-        (100 * ACTIONS, ValueError, r"bounds are \[-1, 1\]; bring the actions to these units"),
-        (np.array([["a"] * 4]), TypeError, "no array of real numbers"),
-        (ACTIONS * 1j, TypeError, "no array of real numbers"),
+        (100 * ACTIONS, ValueError, r"bounds are \[-1, 1\]; scale the actions to these bounds"),
+        (np.array([["a"] * 4]), TypeError, "not an array of real numbers"),
+        (ACTIONS * 1j, TypeError, "not an array of real numbers"),
         (torch.from_numpy(ACTIONS * 1j), TypeError, "complex"),
         (np.ma.masked_greater(ACTIONS, 0.9), ValueError, "masked values; leave their rows out"),
     ],
@@ -115,9 +115,9 @@ def test_gmvae_reconstructs_numpy_and_double_arrays():
 
 @pytest.mark.parametrize("use", USES[:2])
 def test_fit_refuses_one_row_and_warns_of_identical_rows(use):
-    with pytest.raises(ValueError, match=r"1 row\(s\), in which no synergies"):
+    with pytest.raises(ValueError, match=r"1 row\(s\), too few to find synergies"):
         use(gmvae(), ACTIONS[:1])
-    with pytest.warns(UserWarning, match="9 actions are all alike"):
+    with pytest.warns(UserWarning, match="9 actions are the same"):
         assert numbers(use(gmvae(), np.zeros((9, 4)))).isfinite().all()
 
 

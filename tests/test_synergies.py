@@ -181,7 +181,7 @@ def test_any_array_type_is_fitted_and_invalid_arrays_are_refused(kind: str) -> N
     actions[3, 1] = np.nan
     with pytest.raises(ValueError, match="NaN or infinity in 1 of 400 rows, the first in row 3"):
         fitted(kind, actions)
-    with pytest.raises(ValueError, match="bring the actions to these units"):
+    with pytest.raises(ValueError, match="scale the actions to these bounds"):
         fitted(kind, activity() + 9)
     with pytest.raises(ValueError, match=r"only 6 actuators; choose at most 6"):
         fit_synergies(activity(), kind, 7, low=0.0, high=1.0)
@@ -212,7 +212,7 @@ def test_use_before_fit_is_refused(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", AFFINE)
-@pytest.mark.filterwarnings("ignore:The 50 actions are all alike")
+@pytest.mark.filterwarnings("ignore:All 50 actions are the same")
 def test_identical_actions_give_a_finite_decoder(kind: str) -> None:
     for value in (0.0, 0.3):
         actions = torch.full((50, 6), value)

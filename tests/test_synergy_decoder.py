@@ -114,7 +114,7 @@ def test_keys_may_be_single_strings() -> None:
 
 @pytest.mark.parametrize("residual", [-0.1, 1.1])
 def test_residual_outside_zero_to_one_is_refused(residual: float) -> None:
-    with pytest.raises(ValueError, match=r"must lie in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"must be in \[0, 1\]"):
         SynergyDecoder(2, 4, residual=residual)
 
 
@@ -195,7 +195,7 @@ def test_from_directions_survives_a_bundle_round_trip(tmp_path: Path) -> None:
     ("center", "directions", "words"),
     [
         (torch.zeros(4), torch.zeros(2, 3), r"center has shape \[4\] and directions \[2, 3\]"),
-        (torch.tensor([0.0, 1.0]), torch.zeros(1, 2), "Entry 1 of the center is not inside"),
+        (torch.tensor([0.0, 1.0]), torch.zeros(1, 2), "Entry 1 of center is not inside"),
     ],
 )
 def test_invalid_directions_are_refused(center: Tensor, directions: Tensor, words: str) -> None:

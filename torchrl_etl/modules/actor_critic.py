@@ -84,7 +84,7 @@ def make_layers(
         if len(set(hidden)) != 1:
             raise ValueError(
                 f"hidden is {list(hidden)}; a residual body adds each block to the one before, so "
-                "its blocks must be of one width, such as [64, 64] for two of them."
+                "all blocks must have the same width, such as [64, 64] for two of them."
             )
         width = hidden[0]
         bfloat16 = body == "residual_bfloat16"

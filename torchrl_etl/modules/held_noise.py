@@ -62,8 +62,8 @@ class HeldNoise(TensorDictModuleBase):
         kind = getattr(kind, "func", kind)  # unwraps a partial
         if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
             raise ValueError(
-                f"The actor draws from {getattr(kind, '__name__', kind)}; noise is held in a "
-                "TanhNormal, such as make_actor's."
+                f"The actor samples from {getattr(kind, '__name__', kind)}; held noise needs a "
+                "TanhNormal, as from make_actor."
             )
         super().__init__()
         self.actor, self.init_key = actor, init_key

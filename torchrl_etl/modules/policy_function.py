@@ -48,7 +48,7 @@ def policy_function(
     if list(policy.in_keys) != [observation_key] or action_key not in policy.out_keys:
         raise ValueError(
             f"The policy reads {list(policy.in_keys)} and writes {list(policy.out_keys)}; it must "
-            f"read {observation_key!r} alone and write {action_key!r}, else name other keys."
+            f"read only {observation_key!r} and write {action_key!r}; otherwise pass other keys."
         )
     device = next((tensor.device for tensor in policy.parameters()), None)
 

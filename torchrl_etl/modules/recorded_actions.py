@@ -56,11 +56,13 @@ def as_actions(
         found = actions if isinstance(actions, Tensor) else _from_array(actions)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(
-            f"The actions are a {type(actions).__name__} that is no array of real numbers; pass "
+            f"The actions are a {type(actions).__name__}, not an array of real numbers; pass "
             f"an array [N, {len(low)}]."
         ) from error
     if found.is_complex():
-        raise TypeError(f"The actions are {found.dtype}; pass an array [N, {len(low)}] of reals.")
+        raise TypeError(
+            f"The actions are {found.dtype}; pass an array [N, {len(low)}] of real numbers."
+        )
     if found.ndim == 0 or found.shape[-1] != len(low):
         raise ValueError(
             f"The actions have shape {tuple(found.shape)}, but there are {len(low)} actuators; "
@@ -73,19 +75,19 @@ def as_actions(
         return found
     if len(rows) < min_rows:
         raise ValueError(
-            f"The actions have {len(rows)} row(s), in which no synergies can be found; pass at "
-            f"least {min_rows} different actions, [N, {len(low)}]."
+            f"The actions have {len(rows)} row(s), too few to find synergies; pass at least "
+            f"{min_rows} different actions, [N, {len(low)}]."
         )
     if bool((rows == rows[0]).all()):
         warnings.warn(
-            f"The {len(rows)} actions are all alike, so there are no synergies in them.",
+            f"All {len(rows)} actions are the same, so they have no synergies.",
             stacklevel=3,
         )
     elif (reach := float(((rows - low) / (high - low)).max())) < LEAST_REACH:
         warnings.warn(
-            f"The actions keep within {reach:.2g} of the way from their lower to their upper "
-            "bound, where a decoder of synergies cannot follow them; give the model low= and high= "
-            "in the units of the actions.",
+            f"The actions reach only {reach:.2g} of the way from their lower to their upper bound, "
+            "too little for a decoder to reproduce; pass the model low= and high= in the units of "
+            "the actions.",
             stacklevel=3,
         )
     return rows
@@ -159,6 +161,6 @@ def _check_values(rows: Tensor, low: Tensor, high: Tensor) -> None:
     if ((rows < low - margin) | (rows > high + margin)).any():
         raise ValueError(
             f"The actions lie between {rows.min():g} and {rows.max():g}, but the bounds are "
-            f"[{low.min():g}, {high.max():g}]; bring the actions to these units, or give "
-            "the model low= and high= of theirs."
+            f"[{low.min():g}, {high.max():g}]; scale the actions to these bounds, or pass the "
+            "model low= and high= in the units of the actions."
         )

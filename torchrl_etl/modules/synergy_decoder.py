@@ -126,8 +126,8 @@ class SynergyDecoder(SynergyMap):
     ) -> None:
         if not 0.0 <= residual <= 1.0:
             raise ValueError(
-                f"residual is {residual}; it is the share of an actuator's half range that the "
-                "policy may move directly and must lie in [0, 1]."
+                f"residual is {residual}; it must be in [0, 1], the share of an actuator's half "
+                "range that the policy may move directly."
             )
         decoder = ActionDecoder(num_synergies, action_dim, low=low, high=high, hidden=hidden)
         super().__init__(
@@ -247,8 +247,8 @@ class SynergyDecoder(SynergyMap):
         unit = scaled.decoder.normalize(center)
         if not (unit.abs() < 1).all():
             raise ValueError(
-                f"Entry {int((~(unit.abs() < 1)).nonzero()[0])} of the center is not inside the "
-                "action bounds, where nothing could move it; move it inside."
+                f"Entry {int((~(unit.abs() < 1)).nonzero()[0])} of center is not inside the action "
+                "bounds, so no synergy could move it; move it inside."
             )
         slope = 2 / (scaled.decoder.high - scaled.decoder.low) / (1 - unit.square())
         (layer,) = (m for m in scaled.decoder.modules() if isinstance(m, nn.Linear))
