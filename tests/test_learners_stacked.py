@@ -230,7 +230,7 @@ def test_transforms_of_stacked_learners_share_no_state():
 
 def test_transform_with_an_undeclared_network_is_refused():
     learners, inputs = paid_learners(lambda: Pays(torch.nn.Linear(3, 1)))
-    with pytest.raises(ValueError, match="Pays gives another reward than alone"):
+    with pytest.raises(ValueError, match="Pays gives a different reward with several"):
         StackedLearners(learners).updates(inputs)
 
 
@@ -263,7 +263,9 @@ def test_synergy_models_with_different_update_counts_are_refused():
 
 def test_learners_of_different_sizes_are_refused():
     small, large = (learn_stage(None, f"actor.hidden=[{width}]") for width in (8, 16))
-    with pytest.raises(ValueError, match=r"learners\[1\] has parameters of other shapes"):
+    with pytest.raises(
+        ValueError, match=r"learners\[1\] and learners\[0\] have parameters of different shapes"
+    ):
         StackedLearners([small.learner, large.learner])
     with pytest.raises(ValueError, match="learners is empty"):
         StackedLearners([])

@@ -125,7 +125,7 @@ def test_support_with_multi_step_value_estimators_is_refused() -> None:
     loss = make_loss(bins=11, support=torch.linspace(-5.0, 5.0, 11))
     loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     for kind in (ValueEstimators.TD1, ValueEstimators.TDLambda):
-        with pytest.raises(ValueError, match="with a support targets are distributions"):
+        with pytest.raises(ValueError, match="targets with a support are one-step"):
             loss.make_value_estimator(kind, gamma=GAMMA)
 
 
@@ -134,7 +134,7 @@ def test_critic_size_that_differs_from_the_support_is_refused(
     bins: int, entries: int | None
 ) -> None:
     support = None if entries is None else torch.linspace(-5.0, 5.0, entries)
-    words = rf"write is {bins}, and the support has {entries or 1} \(1 stands for none\)"
+    words = rf"last size of {bins} but the support has {entries or 1} bins \(1 means no support\)"
     with pytest.raises(ValueError, match=words):
         make_loss(bins=bins, support=support)(TestLeanSACLoss().make_data())
 
@@ -237,7 +237,7 @@ def test_composite_action_under_one_key_gives_the_values_of_torchrls_loss() -> N
 
 
 def test_entropy_dims_require_a_tanh_gaussian_actor() -> None:
-    with pytest.raises(ValueError, match="entropy_dims is 1, but the actor is no tanh-Gaussian"):
+    with pytest.raises(ValueError, match="entropy_dims is 1, but the actor is not a tanh-Gaussian"):
         LeanSACLoss(composite_actor(), make_critic({"observation": 3, "action": 2}), entropy_dims=1)
 
 
@@ -250,11 +250,11 @@ def test_composite_action_under_several_keys_is_refused() -> None:
 def test_critic_with_several_outputs_must_write_the_value_key() -> None:
     actor, critic = make_loss().actor_network, two_outputs()
     loss = LeanSACLoss(actor, critic, target_entropy=-1.0)
-    with pytest.raises(ValueError, match="let one of them be 'q'"):
+    with pytest.raises(ValueError, match="one of them must be 'q'"):
         loss.set_keys(state_action_value="q")
     loss.set_keys(state_action_value="beside")
     critic.out_keys = ["first", "second"]
-    with pytest.raises(ValueError, match="let one of them be 'state_action_value'"):
+    with pytest.raises(ValueError, match="one of them must be 'state_action_value'"):
         LeanSACLoss(actor, critic, target_entropy=-1.0)
 
 

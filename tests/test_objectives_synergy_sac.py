@@ -124,10 +124,10 @@ def test_action_key_does_not_change_the_losses() -> None:
 
 
 def test_action_key_that_the_critic_reads_is_refused() -> None:
-    with pytest.raises(ValueError, match="could not be told from a fresh one"):
+    with pytest.raises(ValueError, match="replayed and fresh actions would be confused"):
         make_loss().set_keys(action="action")
     decoder = SynergyDecoder(SYNERGIES, ACTION)
-    with pytest.raises(ValueError, match=r"sample goes to 'synergy', which the critic reads"):
+    with pytest.raises(ValueError, match=r"writes its sample to 'synergy', which the critic reads"):
         SynergySACLoss(
             make_actor({"observation": 3}, decoder.synergy_spec, out_key="synergy"),
             make_critic({"synergy": SYNERGIES, "action": ACTION}),

@@ -28,7 +28,7 @@ from torchrl_etl.learners.products import faster_products
 
 __all__ = ["compiled", "cuda_graph"]
 
-_ELSE = "compile=false leaves out the attempt"
+_ELSE = "compile=false skips compilation"
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -73,7 +73,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             failed = True
             warnings.warn(
-                f"Updates run uncompiled, which takes about twice the time: {_reason(error)}.",
+                f"Updates run uncompiled, which takes about twice as long: {_reason(error)}.",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -181,18 +181,18 @@ def _reason(error: BaseException) -> str:
                 name = names if isinstance(names, str) else names[-1]
                 return (
                     f"there is no C++ compiler ({name} does not run); install one "
-                    "(apt install g++), or name one in the variable CXX"
+                    "(apt install g++), or set the variable CXX to one"
                 )
             case TritonMissing():
                 return "Triton, which compiles for GPUs, is not installed; pip install triton"
             case CppCompileError() if "Python.h" in cause.output:
-                return "the headers of Python are missing; install them (apt install python3-dev)"
+                return "the Python headers are missing; install them (apt install python3-dev)"
             case CppCompileError():
                 return f"the C++ compiler failed ({_first_line(cause.output)}); {_ELSE}"
             case OSError() if cause.filename:
                 return (
-                    f"{cause.filename}: {cause.strerror}; name a folder that can be written, and "
-                    "has room, in the variable TORCHINDUCTOR_CACHE_DIR"
+                    f"{cause.filename}: {cause.strerror}; set the variable TORCHINDUCTOR_CACHE_DIR "
+                    "to a writable folder with free space"
                 )
     told = getattr(error, "inner_exception", None) or error
     return f"{type(told).__name__}: {_first_line(str(told))}; {_ELSE}"
@@ -208,4 +208,4 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 def _first_line(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     telling = [line for line in lines if "error" in line or "cannot" in line]
-    return (telling or lines or ["without a word"])[0].rstrip(".")
+    return (telling or lines or ["no message"])[0].rstrip(".")

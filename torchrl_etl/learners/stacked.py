@@ -57,12 +57,12 @@ class StackedLearners:
 
     def __init__(self, learners: Sequence[SACLearner]) -> None:
         if not learners:
-            raise ValueError("learners is empty; give at least one.")
+            raise ValueError("learners is empty; pass at least one.")
         shapes = [[parameter.shape for parameter in of.parameters] for of in learners]
         if other := next((i for i, found in enumerate(shapes) if found != shapes[0]), None):
             raise ValueError(
-                f"learners[{other}] has parameters of other shapes than learners[0]; learners are "
-                "updated side by side only where observations, actions and networks agree."
+                f"learners[{other}] and learners[0] have parameters of different shapes; learners "
+                "that are updated side by side need the same observations, actions and networks."
             )
         self.learners = list(learners)
         self._stacks: dict[int, Tensor] = {}
@@ -120,9 +120,9 @@ class StackedLearners:
             if (found - alone).abs().max() > rounding:
                 names = ", ".join(type(transform).__name__ for transform in first.transforms)
                 raise ValueError(
-                    f"Beside other seeds {names} gives another {first.reward} than alone, so it "
-                    "reads modules that are not known to be its own; give it an attribute "
-                    "networks, a tuple of them."
+                    f"{names} gives a different {first.reward} with several seeds than with one, "
+                    "so it reads modules that are not known to belong to it; list them in its "
+                    "attribute networks, a tuple."
                 )
 
     def _held(self) -> TensorDictBase:
@@ -148,8 +148,8 @@ class StackedLearners:
         if len(differing := {learner.step_sizes for learner in self.learners}) > 1:
             raise ValueError(
                 "The learners' updates and rates differ "
-                f"({'; '.join(map(str, sorted(differing)))}); update side by side those that are "
-                "equally far and have the same settings."
+                f"({'; '.join(map(str, sorted(differing)))}); learners that are updated side by "
+                "side need as many updates and the same settings."
             )
         first = self.learners[0].optimizer
         torch._foreach_copy_(*self._rows_and_own())

@@ -20,7 +20,7 @@ def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) 
         >>> read("DecoderLoss", TensorDict({"synergy": 0.0}), "action")
         Traceback (most recent call last):
         ...
-        KeyError: "DecoderLoss reads 'action', which the data lacks; beside it are synergy."
+        KeyError: "DecoderLoss reads 'action', which the data lacks; there it has synergy."
     """
     value = tensordict.get(key, None)
     if value is None:
@@ -29,10 +29,10 @@ def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) 
         if key == "action" and ("next", "executed_action") in there:
             cure = (
                 "; RenameTransform([('next', 'executed_action')], ['action'], create_copy=True) "
-                "makes one of what was executed"
+                "makes one from the executed action"
             )
         raise KeyError(
-            f"{reader} reads {unravel_key((*prefix, key))!r}, which the data lacks; beside it are "
+            f"{reader} reads {unravel_key((*prefix, key))!r}, which the data lacks; there it has "
             f"{', '.join(sorted(map(str, there)))}{cure}."
         )
     return value
@@ -48,8 +48,8 @@ def warn_of_previous_action(reader: str, keys: Iterable[NestedKey]) -> None:
         path = (key,) if isinstance(key, str) else key
         if path[-1] == "executed_action" and path[0] != "next":
             warnings.warn(
-                f"{reader} reads {key!r} at the root, which SynergyAction leaves there from the "
-                "step before; read 'action' in a collector's batches, or ('next', "
+                f"{reader} reads {key!r} at the root, where SynergyAction keeps that of the "
+                "previous step; read 'action' in a collector's batches, or ('next', "
                 "'executed_action').",
                 stacklevel=4,
             )

@@ -108,15 +108,15 @@ class LeanSACLoss(SACLoss):
         check_parts("qvalue_network", qvalue_network, TensorDictModule)
         if len(sampled := list(actor_network.dist_sample_keys)) != 1:
             raise ValueError(
-                f"The actor samples {sampled}; the parts of a composite action must lie under one "
-                "key: give it out_keys=['action'] and its distribution no name_map."
+                f"The actor samples {sampled}; a composite action must be under one key: give the "
+                "actor out_keys=['action'] and its distribution no name_map."
             )
         if entropy_dims is not None:
             check_integer(1, entropy_dims=entropy_dims)
             kind = actor_network[-1].distribution_class
             if not (isinstance(kind, type) and issubclass(kind, TanhNormal)):
                 raise ValueError(
-                    f"entropy_dims is {entropy_dims}, but the actor is no tanh-Gaussian; leave "
+                    f"entropy_dims is {entropy_dims}, but the actor is not a tanh-Gaussian; leave "
                     "entropy_dims out, or give the actor TanhNormal as its distribution."
                 )
         check_choice("reduction", kwargs.get("reduction") or "mean", ("mean", "sum", "none"))
@@ -124,7 +124,7 @@ class LeanSACLoss(SACLoss):
         for name in ("value_network", "skip_done_states"):
             if kwargs.get(name):
                 raise TypeError(
-                    f"{name} is given but {type(self).__name__} bootstraps on its critics, at "
+                    f"{name} is given but {type(self).__name__} bootstraps from its critics at "
                     "every next state; leave it out."
                 )
         super().__init__(actor_network, qvalue_network, loss_function=loss_function, **kwargs)
@@ -152,8 +152,8 @@ class LeanSACLoss(SACLoss):
         one_step = value_type in (None, ValueEstimators.TD0, TD0Estimator)
         if self.support is not None and not (one_step or isinstance(value_type, TD0Estimator)):
             raise ValueError(
-                f"value_type is {value_type}, but with a support targets are distributions, which "
-                "go back one step; take ValueEstimators.TD0, or leave the support out."
+                f"value_type is {value_type}, but targets with a support are one-step "
+                "distributions; use ValueEstimators.TD0, or leave the support out."
             )
         return super().make_value_estimator(value_type, **hyperparams)
 
@@ -192,8 +192,8 @@ class LeanSACLoss(SACLoss):
         bins = 1 if self.support is None else len(self.support)
         if outputs.shape[-1] != bins:
             raise ValueError(
-                f"The last size of what critics write is {outputs.shape[-1]}, and the support has "
-                f"{bins} (1 stands for none); give both as many: make_critic(bins=...), "
+                f"The critics write a last size of {outputs.shape[-1]} but the support has {bins} "
+                "bins (1 means no support); make both equal: make_critic(bins=...), "
                 "support=torch.linspace(...)."
             )
         if self.support is None:
@@ -271,8 +271,8 @@ def _check_support(support: Tensor) -> None:
         or steps.std(correction=0) > 1e-4 * steps.mean()
     ):
         raise ValueError(
-            f"support has shape {list(support.shape)} and must be evenly spaced and ascending, of "
-            "two entries or more; make it with torch.linspace(low, high, bins)."
+            f"support has shape {list(support.shape)}; it must be two or more evenly spaced, "
+            "ascending entries; make it with torch.linspace(low, high, bins)."
         )
 
 
@@ -304,8 +304,7 @@ def value_key(critic: TensorDictModule, name: NestedKey) -> NestedKey:
     if name in outputs:
         return name
     raise ValueError(
-        f"The critic writes {outputs}; let one of them be {name!r}, where the loss looks for the "
-        "value."
+        f"The critic writes {outputs}; one of them must be {name!r}, which the loss reads."
     )
 
 

@@ -139,9 +139,9 @@ class SynergySACLoss(LeanSACLoss):
         super().set_keys(**kwargs)
         if self.tensor_keys.action in self.qvalue_network.in_keys:
             raise ValueError(
-                f"The actor's sample goes to {self.tensor_keys.action!r}, which the critic reads "
-                f"(it reads {list(self.qvalue_network.in_keys)}): a replayed action could not be "
-                "told from a fresh one. Let the critic read the decoded action only."
+                f"The actor writes its sample to {self.tensor_keys.action!r}, which the critic "
+                f"reads (it reads {list(self.qvalue_network.in_keys)}), so replayed and fresh "
+                "actions would be confused; let the critic read only the decoded action."
             )
 
     def _set_in_keys(self) -> None:

@@ -285,9 +285,9 @@ class LatentAction(ModuleTransform):
             unravel_key(key) for key in env.base_env.transform.in_keys_inv or ()
         ):
             warnings.warn(
-                f"The transforms of an inner environment rewrite {self.action_key!r} out of the "
-                f"sight of {name}, so that {self.executed_key!r} is not what the simulator "
-                f"executes; append {name} to that environment instead.",
+                f"The transforms of an inner environment rewrite {self.action_key!r} after {name}, "
+                f"so {self.executed_key!r} is not what the simulator executes; append {name} to "
+                "that environment instead.",
                 stacklevel=2,
             )
         self._check_action(actions[self.action_key])

@@ -59,8 +59,8 @@ class RedrawDirection(Transform):
         followed = tensordict.get(key, None)
         if followed is None or tensordict.get(unravel_key(("next", key)), None) is None:
             raise KeyError(
-                f"RedrawDirection reads {key!r} at both ends of a transition; beside what is "
-                f"missing are {sorted(map(str, tensordict.keys(True, True)))}."
+                f"RedrawDirection reads {key!r} and {unravel_key(('next', key))!r}, but the "
+                f"tensordict has only {sorted(map(str, tensordict.keys(True, True)))}."
             )
         shape = followed.shape[:-1]  # in a group of agents, one each
         drawn = self.primer.draw(shape, followed.device)
@@ -70,6 +70,6 @@ class RedrawDirection(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError(
-            "RedrawDirection is for transitions that are sampled: append it to a replay buffer; "
-            "in an environment DirectionPrimer draws directions."
+            "RedrawDirection is for sampled transitions: append it to a replay buffer, and use "
+            "DirectionPrimer in an environment."
         )
