@@ -87,16 +87,16 @@ def main(config: DictConfig) -> None:
     print(
         f"{chosen} {'synergy accounts' if chosen == 1 else 'synergies account'} for "
         f"{found[chosen].held_out:.0%} of held-out rows"
-        + ("" if enough else f", none of these numbers for {config.vaf:.0%}")
+        + ("" if enough else f"; no tested number reaches {config.vaf:.0%}")
     )
     print(f"  the bundle's decoder, limited to the bounds, for {decoded:.0%} of all rows")
-    print(f"  all of it   {folder}")
+    print(f"  all files   {folder}")
 
 
 def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """Checks all settings; returns the kind of synergies and keyword arguments of its model."""
     if config.data is None:
-        raise ValueError("no recording is named; pass data=FILE, a .csv, .npy or .npz file.")
+        raise ValueError("no recording is given; pass data=FILE, a .csv, .npy or .npz file.")
     if not isinstance(config.leave_out, ListConfig):
         raise ValueError(
             f"leave_out is {config.leave_out!r}; it must be a list of columns, such as [time]."
@@ -119,7 +119,9 @@ def check_folder(folder: Path) -> None:
     """Reject a folder that cannot be created, before minutes of fitting."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not there.is_dir():
-        raise ValueError(f"{there} is a file, so out={folder} can be no folder; choose another.")
+        raise ValueError(
+            f"{there} is a file, so out={folder} cannot be a folder; choose another one."
+        )
 
 
 def check_recording(folder: Path, digest: str) -> None:
@@ -137,8 +139,8 @@ def load(config: DictConfig) -> Recording:
         if not (largest > 0).all():
             muscle = recording.muscles[int((largest <= 0).argmax())]
             raise ValueError(
-                f"{muscle!r} is never above 0, so its largest value is no unit; rectify the "
-                "recording, or leave normalize=false."
+                f"{muscle!r} is never above 0, so its largest value cannot normalize it; rectify "
+                "the recording, or leave normalize=false."
             )
         recording = recording._replace(activity=recording.activity / largest)
     for bound, ends in (("low", recording.activity.min(0)), ("high", recording.activity.max(0))):
@@ -147,15 +149,14 @@ def load(config: DictConfig) -> Recording:
             first = int(beyond.argmax())
             raise ValueError(
                 f"{recording.muscles[first]!r} reaches {ends[first]:g}, beyond {bound}="
-                f"{config[bound]:g}; give low= and high= in the recording's units or "
-                "normalize=true, or leave out what is no muscle with leave_out=."
+                f"{config[bound]:g}; pass low= and high= in the recording's units or "
+                "normalize=true, or leave out columns that are not muscles with leave_out=."
             )
     largest = recording.activity.max()
     if largest - config.low < LEAST_REACH * (config.high - config.low):
         raise ValueError(
-            f"no muscle is above {largest:g}, so near to low={config.low:g} for high="
-            f"{config.high:g} that no bundle could follow; give low= and high= in the recording's "
-            "units or normalize=true."
+            f"no muscle is above {largest:g}, too near low={config.low:g} for a bundle with high="
+            f"{config.high:g}; pass low= and high= in the recording's units, or normalize=true."
         )
     return recording
 
@@ -174,7 +175,7 @@ def numbers_of_synergies(num: Any, muscles: int) -> Sequence[int]:
         ) from None
     numbers = sorted({number for number in asked if number <= muscles})
     if not numbers:
-        raise ValueError(f"num is {num}, more than the {muscles} muscles; ask for fewer synergies.")
+        raise ValueError(f"num is {num}; it must not be above the number of muscles, {muscles}.")
     return numbers
 
 

@@ -125,15 +125,15 @@ DAMAGE = {
     "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("{}"),
     "format version 3 and this torchrl_etl reads 1 and 2": lambda f: edit(f, format_version=3),
     r"lacks \['task'\]": lambda f: edit(f, task=None),
-    r"the unknown \['surprise'\]": lambda f: edit(f, surprise=1),
-    "'x' as low where a JSON array belongs": lambda f: edit(f, low="x"),
-    "5 as task where a JSON string belongs": lambda f: edit(f, task=5),
+    r"has unknown \['surprise'\]": lambda f: edit(f, surprise=1),
+    "low in .* is 'x'; it must be a JSON array": lambda f: edit(f, low="x"),
+    "task in .* is 5; it must be a JSON string": lambda f: edit(f, task=5),
     "do not make a SynergyDecoder": widen,
     "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
     "synergies of 1 actuators": lambda f: edit(f, actuators=["biceps"]),
     "states 99 synergies": lambda f: edit(f, num_synergies=99),
     "states a residual of 0.5 for a decoder with 0.0": lambda f: edit(f, residual=0.5),
-    "actuators that are no JSON strings": lambda f: edit(f, actuators=[1, 2, 3]),
+    "actuators that are not strings": lambda f: edit(f, actuators=[1, 2, 3]),
     "There is no synergy bundle": shutil.rmtree,
 }
 
@@ -201,10 +201,10 @@ def test_saving_refuses_to_overwrite_other_files(bundle):
 def test_saving_refuses_wrong_names_and_facts_that_json_cannot_hold(tmp_path):
     decoder = fitted_decoder()
     for names in (NAMES[:4], NAMES[:4] + NAMES[:1]):
-        with pytest.raises(BundleError, match="decoder for 5 actuators"):
+        with pytest.raises(BundleError, match="decoder of 5 actuators"):
             save_bundle(decoder, tmp_path / "b", task="toy", actuators=names)
     for name, value in (("task", None), ("kind", 3)):
-        with pytest.raises(BundleError, match=f"{name} is {value}; it must be a text"):
+        with pytest.raises(BundleError, match=f"{name} is {value}; it must be a string"):
             save_bundle(decoder, tmp_path / "b", **{"task": "toy", "actuators": NAMES, name: value})
     with pytest.raises(BundleError, match=r"facts\['a'\]\[1\] is a object"):
         save(decoder, tmp_path / "b", a=[1, object()])
@@ -229,7 +229,7 @@ def test_the_same_muscles_and_bounds_are_compatible():
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (NAMES[::-1], "another order .number 0 is 'biceps' in the bundle, 'psoas' in the env"),
+        (NAMES[::-1], "different order .number 0 is 'biceps' in the bundle, 'psoas' in the env"),
         ([*NAMES, "gracilis"], "5 actuators and the environment has 6, .*a part of this body"),
         (NAMES[:3], "also moves 'soleus', 'psoas'.* on a larger body"),
         ([f"finger{i}" for i in range(39)], "has 39, with no name in common"),

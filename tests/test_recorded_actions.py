@@ -97,7 +97,7 @@ def test_unusable_array_is_refused_and_leaves_the_model_unchanged(use, given, er
     [
         ({"updates": 0}, "updates is 0; it must be a whole number, 1 or more"),
         ({"updates": 2, "batch_size": 0}, "batch_size is 0"),
-        ({"updates": 2, "loss": GMVAELoss(gmvae())}, "loss is of another GMVAE"),
+        ({"updates": 2, "loss": GMVAELoss(gmvae())}, "loss is for another GMVAE"),
     ],
 )
 def test_invalid_fit_options_are_refused(options, words):

@@ -67,25 +67,25 @@ def test_numpy_files_of_every_layout_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a,b\n1,2\n3\n", "Line 3 of .* has 1 entries and the first line 2"),
+        ("a,b\n1,2\n3\n", "Line 3 of .* has 1 entries but the first line 2"),
         ("a,b\n1,2\n3,\n5,6\n", "'b' in .* has no value in line 3; fill"),
         ("a,b\n1,2\nNaN,3\n5,NA\n", "'a' in .* no value in line 3, one of 2 such places"),
         ("a,b\n1,2\n\n\nNaN,3\n5,6\n", "'a' in .* has no value in line 5;"),
         ('"a","b\n(mV)"\n1,2\nx,3\n', "'a' in .* has 'x', not a number, in line 4"),
         ("a,b\n1,2\nx,3\n", "'a' in .* has 'x', not a number, in line 3; .*leave_out=\\[a\\]"),
-        ("a;b\n0,5;0,6\n", "'a' in .* decimal comma in line 2; .*0.5 in place of 0,5"),
-        ("a\tb\n1\t2\n1\t-,5e-3\n", "'b' in .* decimal comma in line 3; .*-.5e-3 in place of"),
-        ('a,b\n1,2\n"3,4\n5,6\n', "Line 3 of .* has quotation marks that do not pair up"),
+        ("a;b\n0,5;0,6\n", "'a' in .* decimal comma in line 2; .*0.5 instead of 0,5"),
+        ("a\tb\n1\t2\n1\t-,5e-3\n", "'b' in .* decimal comma in line 3; .*-.5e-3 instead of"),
+        ('a,b\n1,2\n"3,4\n5,6\n', "Line 3 of .* has unmatched quotation marks"),
         ('a,b\n1,2\n3,"4\n' + "5,6\n" * 50_000, "Line 3 of .*emg.csv .*larger than field limit"),
         ("a,b\n1,2\n1,3\n", "'a' in .* has the same value in every row; .*leave_out=\\[a\\]"),
         ("a (mV);b, left\n1;2\n1;3\n", "'a \\(mV\\)' .*with \"leave_out=\\['a \\(mV\\)'\\]\""),
         ("a,a\n1,2\n2,3\n", "2 columns 'a'"),
         (",a\n1,2\n2,3\n", "Column 1 of .* has no name"),
-        ("trial,a\nx,2\n,3\n", "does not say which trial line 3 is of"),
+        ("trial,a\nx,2\n,3\n", "has no trial in line 3"),
         ("1,2\n3,4\n", "names no columns"),
         ("", "names no columns"),
         ("a,b\n1,2\n", "1 row"),
-        ("trial\n1\n2\n", "no column that is a muscle"),
+        ("trial\n1\n2\n", "no muscle columns"),
     ],
 )
 def test_invalid_table_is_refused(text, words, tmp_path):
@@ -122,11 +122,11 @@ def test_unreadable_file_is_refused(tmp_path):
     for name, words in {
         "pickle.npy": "does not hold arrays of numbers",
         "cube.npy": r"shape \(2, 3, 4\)",
-        "two.npz": "has the arrays a, b; keep the one",
+        "two.npz": "has the arrays a, b; keep only the one",
         "ragged.npz": "3 and 4 rows",
         "names.npz": "1 names for the 6 columns",
         "gap.npz": "'a' in .* has no value in row 1;",
-        "trial.npz": "which trial row 1 is of",
+        "trial.npz": "has no trial in row 1",
         "text.npz": "'a' in .* of type",
         "trials.npz": "3 entries of 'trial' for the 4 rows of emg",
         "renamed.npz": r"shape \(2, 3, 4\)",
@@ -136,7 +136,7 @@ def test_unreadable_file_is_refused(tmp_path):
         "open.npy": "does not hold arrays of numbers",
         "unparsed.npy": "does not hold arrays of numbers",
         "vast.npy": r"does not hold arrays of numbers \(.*allocate",
-        "latin.csv": "not a text in UTF-8",
+        "latin.csv": "not UTF-8 text",
         "emg.mat": "pass a .csv, .npy or .npz file",
         "none.csv": "no file",
     }.items():
@@ -150,7 +150,7 @@ def test_folds_keep_trials_together_and_are_balanced():
     assert [set(trials[part]) for part in parts] == [{"a"}, {"b", "c", "d"}]
     assert sorted(np.concatenate(parts)) == list(range(10))
     assert len(held_out_rows(10, folds=9, trials=trials)) == 4
-    with pytest.raises(ValueError, match="All rows are of trial a"):
+    with pytest.raises(ValueError, match="All rows belong to trial a"):
         held_out_rows(3, trials=["a"] * 3)
     for trials in ([0.0, 1.0, np.nan, 1.0], ["a", "b", None, "b"]):
         with pytest.raises(ValueError, match="Row 2 has no trial"):
@@ -245,17 +245,17 @@ def test_results_of_another_recording_are_not_overwritten(tmp_path, monkeypatch,
         (["kind=nmff"], "kind is 'nmff'; choose one of"),
         (["num=0"], "num is 0; it must be numbers of synergies"),
         (["num=a..b"], "num is 'a..b'"),
-        (["num=[7,8]"], "more than the 6 muscles"),
-        (["high=0.5"], "beyond high=0.5; give low= and high="),
-        (["high=1000"], "so near to low=0 for high=1000 that no bundle could follow; give low="),
+        (["num=[7,8]"], "not be above the number of muscles, 6"),
+        (["high=0.5"], "beyond high=0.5; pass low= and high="),
+        (["high=1000"], "too near low=0 for a bundle with high=1000; pass low="),
         (["trial=subject"], "no column 'subject'"),
         (["leave_out=m0"], "leave_out is 'm0'; it must be a list"),
-        (["data=null"], "no recording is named"),
+        (["data=null"], "no recording is given"),
         (["data=other.csv"], "no file"),
         (["normalise=true"], "did you mean normalize"),
         (["knd=nmf"], "did you mean kind"),
-        (["out=emg.csv"], "emg.csv is a file, so out=emg.csv can be no folder"),
-        (["out=emg.csv/new"], "emg.csv is a file, so out=emg.csv/new can be no folder"),
+        (["out=emg.csv"], "emg.csv is a file, so out=emg.csv cannot be a folder"),
+        (["out=emg.csv/new"], "emg.csv is a file, so out=emg.csv/new cannot be a folder"),
     ],
 )
 def test_invalid_setting_of_the_command_is_refused(arguments, words, tmp_path, monkeypatch, capsys):

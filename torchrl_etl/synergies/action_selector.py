@@ -46,8 +46,8 @@ class ActionSelector:
         check_real("(0, 1]", best_share=best_share)
         if best_share < 1 and actions == "policy":
             raise ValueError(
-                f"best_share is {best_share}, a share by reward, but actions=policy shows what the "
-                "policy would do now, which has no recorded reward; use actions=mean."
+                f"best_share is {best_share} and selects by reward, but actions=policy uses fresh "
+                "actions, which have no recorded reward; use actions=mean."
             )
         self.actor, self.actions, self.best_share = actor, actions, best_share
 

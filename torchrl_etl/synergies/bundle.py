@@ -89,12 +89,12 @@ def save_bundle(
     kind = default_kind(decoder.is_affine) if kind is None else kind
     for name, value in {"task": task, "kind": kind}.items():
         if not isinstance(value, str):
-            raise BundleError(f"{name} is {value!r}; it must be a text.")
+            raise BundleError(f"{name} is {value!r}; it must be a string.")
     actuators = tuple(map(str, actuators))
     if len(actuators) != decoder.action_dim or len(set(actuators)) != len(actuators):
         raise BundleError(
-            f"{len(actuators)} actuator names ({len(set(actuators))} different) came with a "
-            f"decoder for {decoder.action_dim} actuators; pass one name for each, in order."
+            f"There are {len(actuators)} actuator names ({len(set(actuators))} different) for a "
+            f"decoder of {decoder.action_dim} actuators; pass one name for each, in order."
         )
     state, encoder = decoder.state_dict(), decoder.encoder
     if encoder is not None:
@@ -198,8 +198,8 @@ def load_bundle(
     if bounds != (info.low, info.high) or sizes != (info.num_synergies, len(info.actuators)):
         raise BundleError(
             f"{DESCRIPTION} in {str(folder)!r} states {info.num_synergies} synergies of "
-            f"{len(info.actuators)} actuators, or bounds, that its decoder of {sizes[0]} synergies "
-            f"of {sizes[1]} actuators does not have; it was edited, so copy the bundle again."
+            f"{len(info.actuators)} actuators, but its decoder has {sizes[0]} of {sizes[1]}, or "
+            "other bounds; it was edited, so copy the bundle again."
         )
     return decoder, info
 

@@ -80,7 +80,7 @@ def read_description(folder: Path) -> BundleInfo:
     if version not in (1, FORMAT_VERSION):
         raise BundleError(
             f"{path} has format version {version!r} and this torchrl_etl reads 1 and "
-            f"{FORMAT_VERSION}; load it with the version that wrote it, or explore anew."
+            f"{FORMAT_VERSION}; load it with the version that wrote it, or explore again."
         )
     content.pop("num_components", None)  # redundant entry of earlier bundles
     known = {item.name for item in fields(BundleInfo)}
@@ -89,19 +89,19 @@ def read_description(folder: Path) -> BundleInfo:
     if set(content) != known:
         missing, extra = sorted(known - set(content)), sorted(set(content) - known)
         raise BundleError(
-            f"{path} lacks {missing} and has the unknown {extra}; it was edited, so copy the "
-            "bundle again."
+            f"{path} lacks {missing} and has unknown {extra}; it was edited, so copy the bundle "
+            "again."
         )
     kinds = {"actuators": list, "low": list, "high": list, "config": dict, "facts": dict}
     for key, kind in {"task": str, **kinds}.items():
         if not isinstance(content[key], kind):
             named = {list: "array", dict: "object", str: "string"}[kind]
             raise BundleError(
-                f"{path} has {content[key]!r} as {key} where a JSON {named} belongs; copy the "
+                f"{key} in {path} is {content[key]!r}; it must be a JSON {named}, so copy the "
                 "bundle again."
             )
     if not all(isinstance(name, str) for name in content["actuators"]):
-        raise BundleError(f"{path} has actuators that are no JSON strings; copy the bundle again.")
+        raise BundleError(f"{path} has actuators that are not strings; copy the bundle again.")
     if content["residual"] != (own := content["config"].get("residual", 0.0)):
         raise BundleError(
             f"{path} states a residual of {content['residual']!r} for a decoder with {own!r}; it "
@@ -111,8 +111,8 @@ def read_description(folder: Path) -> BundleInfo:
         content["kind"] = default_kind(not content["config"].get("hidden", True))
     if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
         raise BundleError(
-            f"{path} has {content['kind']!r} as kind, which must be a text, and "
-            f"{content['encoder']!r} as encoder, an object or null; copy the bundle again."
+            f"{path} has kind {content['kind']!r}, which must be a string, and encoder "
+            f"{content['encoder']!r}, which must be an object or null; copy the bundle again."
         )
     content |= {key: tuple(content[key]) for key in ("actuators", "low", "high")}
     return BundleInfo(**content)
@@ -142,7 +142,7 @@ def check_compatible(
         Traceback (most recent call last):
         ...
         torchrl_etl.synergies.bundle_info.BundleError: The bundle of 'toy' and the environment
-        have the same 2 actuators in another order (number 0 is 'a' in the bundle, 'b' in the
+        have the same 2 actuators in different order (number 0 is 'a' in the bundle, 'b' in the
         environment); ...
     """
     actuators = tuple(actuators)
@@ -157,9 +157,9 @@ def check_compatible(
             raise BundleError(
                 f"The bundle of {info.task!r} has other {side} action bounds than the environment "
                 f"for {int(differ.sum())} of {len(ours)} actuators ({actuators[first]!r}: "
-                f"{ours[first]:g} in the bundle, {theirs[first]:g} in the environment); the action "
-                "is scaled otherwise, as happens between versions of a simulator or with another "
-                "action wrapper, so use the same ones or explore anew."
+                f"{ours[first]:g} in the bundle, {theirs[first]:g} in the environment); actions "
+                "are scaled differently, as between versions of a simulator or action wrappers, so "
+                "use the same ones or explore again."
             )
 
 
@@ -176,9 +176,9 @@ def _explain_names(info: BundleInfo, actuators: tuple[str, ...]) -> str:
     if not missing and not extra:
         where = next(i for i in range(ours) if info.actuators[i] != actuators[i])
         return (
-            f"{start} and the environment have the same {ours} actuators in another order (number "
-            f"{where} is {info.actuators[where]!r} in the bundle, {actuators[where]!r} in the "
-            "environment); bring the environment's actions into the bundle's order."
+            f"{start} and the environment have the same {ours} actuators in different order "
+            f"(number {where} is {info.actuators[where]!r} in the bundle, {actuators[where]!r} in "
+            "the environment); bring the environment's actions into the bundle's order."
         )
     counts = f"{start} moves {ours} actuators and the environment has {theirs}"
     if len(missing) == ours:

@@ -145,7 +145,7 @@ def fit_gmvae(
     actions = as_actions(actions, low=gmvae.low, high=gmvae.high, min_rows=2)
     loss = GMVAELoss(gmvae) if loss is None else loss
     if loss.gmvae_params["prior_loc"] is not gmvae.prior_loc:
-        raise ValueError("loss is of another GMVAE; pass GMVAELoss(gmvae), or leave it out.")
+        raise ValueError("loss is for another GMVAE; pass GMVAELoss(gmvae), or leave it out.")
     optimizer = torch.optim.Adam(gmvae.parameters(), lr=lr, fused=True)
     for _ in range(updates):
         on_update()

@@ -95,12 +95,12 @@ def read_recording(
         for row, name in enumerate(trials):
             if name.strip().lower() in _MISSING:
                 raise ValueError(
-                    f"{path} does not say which {trial} {_place(lines, row)} is of; fill it in, or "
-                    "leave the row out."
+                    f"{path} has no {trial} in {_place(lines, row)}; fill it in, or leave the row "
+                    "out."
                 )
     columns = [(name, c) for name, c in columns if name != trial and name not in leave_out]
     if not columns:
-        raise ValueError(f"{path} has no column that is a muscle; pass a file that has some.")
+        raise ValueError(f"{path} has no muscle columns; pass a file that has some.")
     activity = np.stack([_numbers(path, name, column, lines) for name, column in columns], -1)
     muscles = tuple(name for name, _ in columns)
     _check(path, muscles, activity, lines)
@@ -116,7 +116,7 @@ def _read_csv(path: Path) -> tuple[Columns, Lines]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text in UTF-8 ({error.reason}); save it so.") from error
+        raise ValueError(f"{path} is not UTF-8 text ({error.reason}); save it as UTF-8.") from error
     head = lines[0] if lines else ""
     rows = _rows(path, lines, max("\t;,", key=head.count))
     names = [name.strip() for name in rows[0][1]] if rows else []
@@ -133,7 +133,7 @@ def _read_csv(path: Path) -> tuple[Columns, Lines]:
     for number, row in rows:
         if len(row) != len(names):
             raise ValueError(
-                f"Line {number} of {path} has {len(row)} entries and the first line {len(names)}; "
+                f"Line {number} of {path} has {len(row)} entries but the first line {len(names)}; "
                 "complete it or leave it out."
             )
     columns = [(name, [row[i].strip() for _, row in rows]) for i, name in enumerate(names)]
@@ -151,8 +151,8 @@ def _rows(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[
             first = reader.line_num + 1
     except csv.Error as error:
         raise ValueError(
-            f"Line {first} of {path} has quotation marks that do not pair up ({error}); numbers "
-            "need none, and a name one at each end."
+            f"Line {first} of {path} has unmatched quotation marks ({error}); write numbers "
+            "without, and names with one at each end."
         ) from error
     return rows
 
@@ -167,12 +167,12 @@ def _read_numpy(path: Path, trial: str) -> Columns:
         if len(lengths := {len(column) for _, column in columns}) > 1:
             raise ValueError(
                 f"The arrays of {path} have {' and '.join(map(str, sorted(lengths)))} rows; they "
-                "must have as many as each other."
+                "must have the same number of rows."
             )
         return columns
     if len(matrices) > 1:
         raise ValueError(
-            f"{path} has the arrays {', '.join(matrices)}; keep the one that holds a column for "
+            f"{path} has the arrays {', '.join(matrices)}; keep only the one with a column for "
             "each muscle."
         )
     matrix = archive.pop(matrices[0])
@@ -243,8 +243,8 @@ def _numbers(path: Path, name: str, column: np.ndarray | list[str], lines: Lines
         wrong = next((i for i, entry in enumerate(column) if not _is_number(entry)), None)
         if wrong is not None and _DECIMAL_COMMA.fullmatch(entry := column[wrong]):
             raise ValueError(
-                f"{name!r} in {path} has a decimal comma in {_place(lines, wrong)}; write points "
-                f"in all numbers of the file, {entry.replace(',', '.')} in place of {entry}."
+                f"{name!r} in {path} has a decimal comma in {_place(lines, wrong)}; use decimal "
+                f"points in the whole file, {entry.replace(',', '.')} instead of {entry}."
             )
         if wrong is not None:
             raise ValueError(
@@ -284,7 +284,7 @@ def _place(lines: Lines, row: int) -> str:
 def _check(path: Path, muscles: Sequence[str], activity: np.ndarray, lines: Lines) -> None:
     if len(activity) < 2:
         raise ValueError(
-            f"{path} has {len(activity)} row(s), in which no synergies can be found; record more."
+            f"{path} has {len(activity)} row(s), too few to find synergies; record more."
         )
     rows, columns = np.nonzero(~np.isfinite(activity))
     if rows.size:
