@@ -62,13 +62,13 @@ def main(config: DictConfig) -> None:
                 for _ in sweep:
                     live.update(display.table())
         except KeyboardInterrupt:
-            print("Stopped; all runs are saved. Start it again to go on.")
+            print("Stopped; all runs are saved. Start it again to continue.")
             sys.exit(130)
     failed = [run for run in runs if sweep.status(run) == "failed"]
     for run in failed:
         lines = run.log.read_text(encoding="utf-8").splitlines()
         last = next((line for line in reversed(lines) if line.strip()), "no message")
-        print(f"Failed: {run.name}, {last} (all of it in {run.log})", file=sys.stderr)
+        print(f"Failed: {run.name}, {last} (full log: {run.log})", file=sys.stderr)
     print(f"Evaluations: {sweep.folder / 'results.csv'}")
     sys.exit(1 if failed else 0)
 
@@ -81,14 +81,14 @@ def queue(config: DictConfig) -> list[Run]:
         if not isinstance(value, ListConfig) or not value:
             raise ValueError(f"{name} is {value!r}; it must be a list, such as {name}=[a,b].")
         if len(set(value)) < len(value):
-            raise ValueError(f"{name} is {value}; each of them may be there once.")
+            raise ValueError(f"{name} is {value}; it must not have duplicates.")
     for name in ("settings", "out"):
         if not isinstance(config[name], str):
-            raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
+            raise ValueError(f"{name} is {config[name]!r}; it must be a string.")
     settings = shlex.split(config.settings)
     for setting in translate(settings, CONF):
         if (said_by := SAID_BY.get(setting.lstrip("+~").partition("=")[0])) is not None:
-            raise ValueError(f"settings has {setting}, which is for {said_by} to say.")
+            raise ValueError(f"settings has {setting}; set it with {said_by} instead.")
     for method in config.methods:
         check_choice("methods", method, methods)
     check_integer(1, frames=config.frames, attempts=config.attempts)

@@ -78,7 +78,7 @@ def test_noise_is_drawn_in_worker_processes_too():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ("explore.fit.actions=policy", "explore.fit.actions is 'policy', but with exploration=noi"),
+        ("explore.fit.actions=policy", "explore.fit.actions is 'policy', but exploration=noi"),
         ("explore.fit.actions=mean", "use sampled or activation"),
         ("exploration.color=brown", "exploration.color is 'brown'; choose one of pink, held"),
         ("exploration.std=0", "exploration.std is 0"),

@@ -179,7 +179,7 @@ def test_users_logger_gets_the_scalars_and_another_class_is_refused(tmp_path):
 
 
 def test_model_with_an_unsupported_decoder_is_refused_before_stage_1(tmp_path):
-    words = "NoBundle, whose decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
+    words = "NoBundle and its decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
     with pytest.raises(ValueError, match=words):
         Experiment(config_with_model("NoBundle", tmp_path))
     assert not (tmp_path / "run").exists()
@@ -249,8 +249,8 @@ def test_thrift_method_learns_on_reward_minus_effort(page_files):
     ("key", "value", "words"),
     [
         ("options.price", -1, r"method\.options\.price is -1"),
-        ("options.cost", 1, r"method\.options\.cost is none of the options .*\(price\)"),
-        ("kind", "thrift:Theft", r"method\.kind is .*in thrift there is no class Theft that is"),
+        ("options.cost", 1, r"method\.options\.cost is not an option of .*\(price\)"),
+        ("kind", "thrift:Theft", r"method\.kind is .*thrift has no class Theft that is"),
         ("kind", "thrift:EffortCost", "no class EffortCost that is derived from Method"),
         ("kind", "thrift", r"method\.kind is 'thrift'; choose one of etl, sac, lattice"),
         ("kind", None, r"method\.kind is None; choose one of etl, sac, lattice"),
@@ -291,7 +291,7 @@ def test_exported_command_names_a_users_config_files(page_files):
 @pytest.mark.parametrize(
     ("kind", "error", "words"),
     [
-        ("curiosity:Curiositas", ValueError, "in curiosity there is no class Curiositas that is"),
+        ("curiosity:Curiositas", ValueError, "curiosity has no class Curiositas that is"),
         ("curiosity:Surprise", ValueError, "no class Surprise that is derived from Exploration"),
         ("no_such:Curiosity", ImportError, "There is no module 'no_such' for 'no_such:Curiosity'"),
         ("curiosity", ValueError, r"exploration\.kind is 'curiosity'; choose one of metric, metra"),
@@ -306,7 +306,7 @@ def test_unknown_exploration_kind_is_refused(kind, error, words, page_files):
 
 def test_users_kind_without_a_config_file_is_refused(page_files):
     config = tiny("run_dir=unused", "exploration.kind=curiosity:Curiosity")
-    with pytest.raises(ValueError, match=r"a file of its own in \./conf/exploration\.$"):
+    with pytest.raises(ValueError, match=r"add a file for this kind to \./conf/exploration\.$"):
         Explorer(Experiment(config).context)
 
 

@@ -112,7 +112,7 @@ def test_sar_plays_on_another_task_of_the_same_body(tmp_path):
     ("option", "message"),
     [
         ("rollout_frames=300", r"need 400 for two whole episodes of 100 steps"),
-        ("play_task=myoFingerPoseFixed-v0", r"whose actuators are not those of myoElbow"),
+        ("play_task=myoFingerPoseFixed-v0", r"but its actuators are not those of myoElbow"),
     ],
 )
 def test_sar_refuses_invalid_play_options(option, message, tmp_path):

@@ -163,7 +163,7 @@ def test_damaged_newest_checkpoint_falls_back_to_the_one_before(kind, saved):
     second = saved.checkpoints()[-1]
     DAMAGE[kind](second)
     layer = module(0)
-    with pytest.warns(UserWarning, match=f"{second} is damaged .*; falling back to the one before"):
+    with pytest.warns(UserWarning, match=f"{second} is damaged .*; using the one before"):
         assert saved.load_newest_whole(Checkpoint(module=layer))
     assert (layer.weight == 1).all()
 

@@ -92,7 +92,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("learn.critic.bins=51", "categorical critics need a bound on returns"),
         ("learn.critic.bins=2.5", "bins is 2.5; it must be a whole number"),
         ("learn.critic.bins=51 learn.sac.return_bound=0", "learn.sac.return_bound is 0; it must"),
-        ("logger_kwargs=3", "logger_kwargs is 3; it must be arguments by name"),
+        ("logger_kwargs=3", "logger_kwargs is 3; it must map names to values"),
         ("learn.noise.kind=hold", "choose one of independent, held"),
         ("learn.sac.num_critics=0", "learn.sac.num_critics is 0; it must be a whole number"),
         ("learn.noise.kind=held learn.noise.exponent=0", "learn.noise.exponent is 0; it must be"),
@@ -104,15 +104,15 @@ def test_every_task_of_the_paper_is_valid(task):
         ("learn.sac.ema_decay=1", "learn.sac.ema_decay is 1; it must be a number in [0, 1)"),
         ("learn.sac.unit_rows=1", "unit_rows is 1; it must be true or false"),
         ("critic.body=resnet", "choose one of mlp, residual"),
-        ("frames=10", "frames is 10, of which 600 go into"),
+        ("frames=10", "frames is 10, but the stages before learning take 600"),
         ("actor.hidden=[0]", "actor.hidden is [0]; it must be a list of whole numbers"),
         ("vaf_curve.dims=3", "vaf_curve.dims is 3"),
         ("threads=-1", "threads is -1"),
         ("pictures=abc", "pictures is 'abc'; it must be true or false"),
         ("compile=yes_please", "compile is 'yes_please'; it must be true, false or null"),
-        ("device=null", "device is None; it must be a text"),
+        ("device=null", "device is None; it must be a string"),
         ("device=meta", "device is 'meta'; use cpu"),
-        ("env=3", "env is 3; it must be a text"),
+        ("env=3", "env is 3; it must be a string"),
         ("env=Pendulum-v1 +env_kwargs.gravity=0", "does not take env_kwargs={'gravity': 0}"),
         ("log=tensorboard", "log is 'tensorboard'; it must be a list"),
         ("log=[wandb]", "pip install wandb"),
@@ -140,7 +140,7 @@ def test_cuda_without_a_device_is_refused():
 def test_a_second_run_in_the_same_folder_is_refused(tmp_path):
     experiment = Experiment(tiny(f"run_dir='{tmp_path}/my run'"))
     experiment.folder.open(resume=False)
-    as_a_shell_takes_it = f"go on with it by 'resume={tmp_path}/my run', or"
+    as_a_shell_takes_it = f"continue it with 'resume={tmp_path}/my run', or"
     with pytest.raises(FileExistsError, match=re.escape(as_a_shell_takes_it)):
         Experiment(tiny(f"run_dir='{tmp_path}/my run'")).run()
 
@@ -233,8 +233,8 @@ def test_bfloat16_warns_without_hardware_support(network, monkeypatch, tmp_path)
     without = {"avx2": True, "avx512_f": True, "avx512_bf16": False}
     asked = f"{network}.body=residual_bfloat16"
     assert bfloat16_lines(monkeypatch, tmp_path, without, asked) == [
-        "Warning: this processor has no instructions for bfloat16, so body=residual_bfloat16 takes "
-        "longer than the same in float32, body=residual."
+        "Warning: this processor has no bfloat16 instructions, so body=residual_bfloat16 is slower "
+        "than body=residual, the same in float32."
     ]
 
 

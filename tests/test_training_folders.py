@@ -83,7 +83,7 @@ def test_resume_without_the_only_checkpoint_is_refused(method, stage, tmp_path):
     killed_when_saved(run, 608, f"method={method}", ONLY_AT_THE_END)
     before = rows(run)
     shutil.rmtree(run / "checkpoints")
-    with pytest.raises(OSError, match=f"at frame 608 of stage '{stage}' and holds none"):
+    with pytest.raises(OSError, match=f"at frame 608 of stage '{stage}' but has no checkpoint"):
         resume(run)
     assert before and rows(run) == before
 
@@ -93,7 +93,7 @@ def test_resume_of_a_stopped_run_without_checkpoints_is_refused(tmp_path):
     stopped(run, ONLY_AT_THE_END)
     before = rows(run)
     shutil.rmtree(run / "checkpoints")
-    with pytest.raises(OSError, match="at frame 224 of stage 'explore' and holds none"):
+    with pytest.raises(OSError, match="at frame 224 of stage 'explore' but has no checkpoint"):
         resume(run)
     assert before and rows(run) == before
 
@@ -129,7 +129,7 @@ def test_full_disk_error_names_the_run(tmp_path):
     file = run / "csv" / "scalars" / "learn" / "return.csv"
     file.parent.mkdir(parents=True)
     file.symlink_to(FULL)
-    words = rf"{run} logs cannot be written \(No space left.*'resume={run}'\."
+    words = rf"The log of {run} cannot be written \(No space left.*'resume={run}'\."
     with pytest.raises(OSError, match=words):
         folder.log({"learn/return": 1.0}, 5)
 
@@ -172,7 +172,9 @@ def test_resume_without_any_synergies_names_their_folder(bundle, tmp_path):
     kept = tmp_path / "kept"
     (run / "synergies").rename(kept)
     shutil.rmtree(bundle)
-    with pytest.raises(FileNotFoundError, match=f"is gone; copy that bundle to {run}/synergies"):
+    with pytest.raises(
+        FileNotFoundError, match=f"which no longer exists; copy that bundle to {run}/synergies"
+    ):
         resumed = resumed_config(run)
         Experiment(resumed, resume=run)
     kept.rename(run / "synergies")

@@ -248,7 +248,7 @@ def test_run_of_stage_1_resumes_with_stage_2(tmp_path, uninterrupted):
     experiment.run()
     file = experiment.folder.explored
     file.rename(f"{file}.away")
-    with pytest.raises(OSError, match="is gone, and stage 2 begins with"):
+    with pytest.raises(OSError, match="is missing, and stage 2 needs"):
         Experiment(resumed_config(run, ["stage=all"]), resume=run).run()
     Path(f"{file}.away").rename(file)
     Experiment(resumed_config(run, ["stage=all"]), resume=run).run()

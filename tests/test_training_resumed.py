@@ -77,7 +77,7 @@ def test_settings_newer_than_the_run_take_their_defaults_with_a_warning(file):
     config = OmegaConf.load(file)
     del config.learn["prefill"], config["vaf_curve"]
     file.write_text(OmegaConf.to_yaml(config))
-    with pytest.warns(UserWarning, match=r"did not have learn\.prefill=.*vaf_curve=|vaf_curve=.*"):
+    with pytest.warns(UserWarning, match=r"without learn\.prefill=.*vaf_curve=|vaf_curve=.*"):
         resumed = resumed_config(file.parent, defaults=tiny())
     assert resumed.learn.prefill == tiny().learn.prefill
     assert resumed.vaf_curve == tiny().vaf_curve
@@ -91,15 +91,15 @@ def test_newer_setting_given_on_resume_does_not_warn(file, recwarn):
     asked = not tiny().learn.prefill
     resumed = resumed_config(file.parent, [f"learn.prefill={asked}"], defaults=tiny())
     assert resumed.learn.prefill is asked
-    assert not [warning for warning in recwarn if "did not have" in str(warning.message)]
+    assert not [warning for warning in recwarn if "is of a release without" in str(warning.message)]
 
 
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["+log_every=5"], "+log_every is a setting that is there already; leave the plus out."),
-        (["~learn.frames"], "~learn.frames would take a setting away"),
-        (["~learn.frames=608"], "~learn.frames would take a setting away"),
+        (["+log_every=5"], "+log_every is a setting that already exists; leave out the plus."),
+        (["~learn.frames"], "~learn.frames would remove a setting"),
+        (["~learn.frames=608"], "~learn.frames would remove a setting"),
         (["learn.frame=5"], "no setting 'learn.frame'; did you mean learn.frames?"),
         (["+learn.sac.gama=0.9"], "no setting 'learn.sac.gama'; did you mean learn.sac.gamma?"),
         (["++learn.sac.gama=0.9"], "no setting 'learn.sac.gama'; did you mean learn.sac.gamma?"),
@@ -115,7 +115,7 @@ def test_newer_setting_given_on_resume_does_not_warn(file, recwarn):
         (["learn.sac.num_critics=1"], "learn.sac.num_critics cannot be changed when a run is"),
         (["action_repeat=2"], "action_repeat cannot be changed when a run is resumed"),
         (["learn.frames=[1"], "learn.frames=[1"),
-        (["frames=2000", "learn.frames=900"], "each sets the budget; give one."),
+        (["frames=2000", "learn.frames=900"], "both set the budget; pass only one of them."),
     ],
 )
 def test_invalid_override_on_resume_gives_a_one_line_error(overrides, words, file):
@@ -142,5 +142,5 @@ def test_learn_frames_on_resume_replaces_frames(file):
 def test_a_budget_of_exploring_is_refused_once_that_is_over(file):
     assert resumed_config(file.parent, ["explore.frames=64"]).explore.frames == 64
     (file.parent / "synergies").mkdir()
-    with pytest.raises(ValueError, match=r"has its synergies already; leave explore\.frames out"):
+    with pytest.raises(ValueError, match=r"already has its synergies; leave explore\.frames out"):
         resumed_config(file.parent, ["explore.frames=64"])

@@ -127,7 +127,7 @@ def test_run_begun_with_other_settings_is_refused(tmp_path):
     other = replace(run, command=[run.command[0], "lr=2"])
     Sweep([other], tmp_path / "out", jobs=1).stop()  # the run failed before it began
     (run.path / "config.yaml").write_text("frames: 9")
-    words = r"begun with other settings \(lr=1, lr=2\); give another out=FOLDER"
+    words = r"started with other settings \(lr=1, lr=2\); pass another out=FOLDER"
     with pytest.raises(ValueError, match=words):
         Sweep([other], tmp_path / "out", jobs=1)
 
@@ -181,7 +181,7 @@ def test_ctrl_c_says_that_all_runs_are_saved(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(signal, "signal", lambda *given: None)
     what = ["tasks=[overactuated]", "methods=[sac]", "seeds=[0]", f"out={tmp_path}"]
     assert command("sweep.py", *what) == 130
-    assert "all runs are saved. Start it again to go on." in capsys.readouterr().out
+    assert "all runs are saved. Start it again to continue." in capsys.readouterr().out
 
 
 def test_closing_the_sweep_ends_its_runs(tmp_path):
@@ -211,16 +211,16 @@ def test_second_sweep_in_the_same_folder_is_refused(tmp_path):
         ("frames=0", "frames is 0"),
         ("tasks=myoHandPose", "must be a list"),
         ("settings='learn.sac.rl=1'", r"learn.sac.rl"),
-        ("seeds=[0,0]", r"seeds is \[0, 0\]; each of them may be there once"),
-        ("tasks=[overactuated,overactuated]", "tasks is .*; each of them may be there once"),
-        ("methods=[sac,sac]", "methods is .*; each of them may be there once"),
-        ("settings='learn.n_steps=3 seed=5'", "settings has seed=5, which is for seeds to say"),
-        ("settings='++method=dep'", r"settings has \+\+method=dep, .* for methods"),
-        ("settings='method.kind=dep'", "settings has method=dep, which is for methods to say"),
-        ("settings='goal=random'", "for tasks, as in TASK:random, to say"),
-        ("settings='run_dir=here'", "for out to say"),
-        ("settings=null", "settings is None; it must be a text"),
-        ("out=[a]", r"out is \['a'\]; it must be a text"),
+        ("seeds=[0,0]", r"seeds is \[0, 0\]; it must not have duplicates"),
+        ("tasks=[overactuated,overactuated]", "tasks is .*; it must not have duplicates"),
+        ("methods=[sac,sac]", "methods is .*; it must not have duplicates"),
+        ("settings='learn.n_steps=3 seed=5'", "settings has seed=5; set it with seeds instead"),
+        ("settings='++method=dep'", r"settings has \+\+method=dep; set it with methods"),
+        ("settings='method.kind=dep'", "settings has method=dep; set it with methods instead"),
+        ("settings='goal=random'", "set it with tasks, as in TASK:random, instead"),
+        ("settings='run_dir=here'", "set it with out instead"),
+        ("settings=null", "settings is None; it must be a string"),
+        ("out=[a]", r"out is \['a'\]; it must be a string"),
         ("jobs=-1", "jobs is -1"),
         ("jobs=0", "jobs is 0"),
         ("jobs=two", "jobs is 'two'"),

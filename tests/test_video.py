@@ -189,7 +189,7 @@ def test_video_and_animation_are_written_without_leftovers(tmp_path):
     ("setting", "words"),
     [
         ("video_episodes=0", "video_episodes"),
-        ("video_size=[2048,2048]", "which is more than 4096; choose fewer or smaller"),
+        ("video_size=[2048,2048]", "each side must be at most 4096"),
         ("video_seconds=0", "video_seconds"),
         ("video_before=maybe", "video_before"),
         ("video=1", "video"),

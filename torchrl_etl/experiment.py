@@ -118,8 +118,8 @@ class Experiment:
         folder = Checkpoints(self.folder.checkpoints(stage.name), keep_last=2).newest_whole()
         if folder is None:
             raise FileNotFoundError(
-                f"{self.folder.path} holds no whole checkpoint of stage 2; evaluate a run that has "
-                "begun to learn."
+                f"{self.folder.path} has no complete checkpoint of stage 2; evaluate a run that "
+                "has saved one."
             )
         Checkpoint(policy=stage.learner.policy, progress=stage.progress).load(folder)
         return stage
@@ -185,7 +185,7 @@ class Experiment:
         left = self.config.frames - self.method.charged_frames
         if left < 1:
             raise ValueError(
-                f"frames is {self.config.frames}, of which {self.method.charged_frames} go into "
-                "what comes before learning; give more in all, or less to that."
+                f"frames is {self.config.frames}, but the stages before learning take "
+                f"{self.method.charged_frames}; raise frames, or shorten those stages."
             )
         self.config.learn.frames = left

@@ -54,8 +54,8 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
         >>> find_class("fractions:Fraktion", {}, int)
         Traceback (most recent call last):
         ...
-        ValueError: kind is 'fractions:Fraktion', but in fractions there is no class Fraktion that
-        is derived from int.
+        ValueError: kind is 'fractions:Fraktion', but fractions has no class Fraktion that is
+        derived from int.
     """
     if not isinstance(kind, str) or ":" not in kind:
         check_choice("kind", kind, list(kinds))
@@ -65,7 +65,7 @@ def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T
     found = getattr(own, name, None)
     if not isinstance(found, type) or not issubclass(found, base):
         raise ValueError(
-            f"kind is {kind!r}, but in {module} there is no class {name} that is derived from "
+            f"kind is {kind!r}, but {module} has no class {name} that is derived from "
             f"{base.__name__}."
         )
     return found
@@ -85,8 +85,8 @@ def import_user_module(module: str, usage: str) -> ModuleType:
     if here not in sys.path:
         sys.path.append(here)
     fault = ImportError(
-        f"There is no module {module!r} for {usage}, with the module installed or in the current "
-        "folder."
+        f"There is no module {module!r} for {usage}; the module must be installed or in the "
+        "current folder."
     )
     if not all(part.isidentifier() for part in module.split(".")):
         raise fault

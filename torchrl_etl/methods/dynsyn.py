@@ -39,7 +39,7 @@ class DynSyn(Method):
     weights deviate after that share of the stage's frames, linearly up to ``ceiling`` at the last.
     """
 
-    fixed_settings = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
+    fixed_settings = (("learn.noise.kind", "independent", "the actor has its own noise"),)
     takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
 
     def __init__(self, context: Context) -> None:
@@ -81,7 +81,7 @@ class DynSyn(Method):
     @property
     def groups(self) -> list[int]:
         if self.file.is_file():
-            cure = "move it away, and the muscles are grouped again"
+            cure = "move it away to group the muscles again"
             return read_json(self.file, list, OSError, cure)
         return list(range(len(self.context.spec.actuators)))  # a placeholder
 

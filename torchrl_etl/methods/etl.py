@@ -142,9 +142,9 @@ class ETL(Method):
         decoder = model.decoder(actions)
         if not isinstance(decoder, SynergyDecoder):
             raise ValueError(
-                f"synergies.kind is {self.context.config.synergies.kind}, whose decoder is a "
-                f"{type(decoder).__name__}; bundles and stage 2 need a SynergyDecoder, such as "
-                "SynergyDecoder.from_directions makes."
+                f"synergies.kind is {self.context.config.synergies.kind} and its decoder is a "
+                f"{type(decoder).__name__}; bundles and stage 2 need a SynergyDecoder, such as one "
+                "from SynergyDecoder.from_directions."
             )
 
     # Stage 1 -----------------------------------------------------------------------------------
@@ -157,8 +157,8 @@ class ETL(Method):
             return own
         if (self.context.folder.path / "config.yaml").exists() and not Path(given).exists():
             raise FileNotFoundError(
-                f"{self.context.folder.path} learns with the synergies of {given}, which is gone; "
-                f"copy that bundle to {own}."
+                f"{self.context.folder.path} needs the synergies of {given}, which no longer "
+                f"exists; copy that bundle to {own}."
             )
         return Path(given)
 
@@ -318,11 +318,10 @@ class ETL(Method):
         try:
             tensors = safetensors.torch.load(file.read_bytes())
         except (FileNotFoundError, safetensors.SafetensorError) as error:
-            fault = "gone" if isinstance(error, FileNotFoundError) else f"damaged ({error})"
+            fault = "missing" if isinstance(error, FileNotFoundError) else f"damaged ({error})"
             raise OSError(
-                f"{file} is {fault}, and stage 2 begins with the transitions in it; start a new "
-                f"run, with synergies={self.context.folder.path} if it shall have the same "
-                "synergies."
+                f"{file} is {fault}, and stage 2 needs the transitions in it; start a new run "
+                f"(with synergies={self.context.folder.path} to keep the same synergies)."
             ) from error
         rows = TensorDict(tensors, tensors["action"].shape[:1]).unflatten_keys(".")
         missing = decoder.synergy_dim - rows["synergy"].shape[-1]

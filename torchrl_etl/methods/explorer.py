@@ -47,9 +47,8 @@ class Explorer:
         self.exploration = make_exploration(context)
         if not self.exploration.trains_policy and fit["actions"] in ("policy", "mean"):
             raise ValueError(
-                f"explore.fit.actions is {fit['actions']!r}, but with exploration="
-                f"{context.config.exploration.kind} no policy learns whose actions could be shown; "
-                "use sampled or activation."
+                f"explore.fit.actions is {fit['actions']!r}, but exploration="
+                f"{context.config.exploration.kind} trains no policy; use sampled or activation."
             )
         self.model = make_synergy_model(context)
         self.relabel = self.exploration.relabel_transforms()
@@ -169,8 +168,8 @@ def _make(
             raise
         cure = f"choose {section}={kind}, which brings its own"
         if kind not in kinds:
-            cure = f"give this kind a file of its own in ./conf/{section}"
+            cure = f"add a file for this kind to ./conf/{section}"
         raise ValueError(
-            f"{section}.kind is {kind}, but the section holds options of another kind ({error}); "
+            f"{section}.kind is {kind}, but the section has options of another kind ({error}); "
             f"{cure}."
         ) from error

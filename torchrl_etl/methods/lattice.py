@@ -23,7 +23,7 @@ class Lattice(Method):
     keyword arguments of :func:`~torchrl_etl.baselines.make_lattice_actor`.
     """
 
-    fixed_settings = (("learn.noise.kind", "independent", "the actor has noise of its own"),)
+    fixed_settings = (("learn.noise.kind", "independent", "the actor has its own noise"),)
     takes = ("state_dependent", "freq", "log_std_init", "log_std_bounds", "alpha", "std_reg")
 
     def __init__(self, context: Context) -> None:

@@ -48,9 +48,9 @@ class Method(ABC):
         for name in self.options:
             if name not in self.takes:
                 raise ValueError(
-                    f"method.options.{name} is none of the options of method={config.method.name} "
+                    f"method.options.{name} is not an option of method={config.method.name} "
                     f"({', '.join(self.takes) or 'it has none'}); settings of the learner, such as "
-                    "the discount, are those of learn, such as learn.sac.gamma."
+                    "the discount, are under learn (learn.sac.gamma)."
                 )
         if not self.has_synergies and (config.stage != "all" or config.synergies.bundle):
             raise ValueError(

@@ -67,8 +67,8 @@ class SAR(Method):
             self.play_spec = EnvironmentSpec.of(env, context.device)
             if self.play_spec.actuators != context.spec.actuators:
                 raise ValueError(
-                    f"method.options.play_task is {self.task}, whose actuators are not those of "
-                    f"{config.env}; play on a task of the same body."
+                    f"method.options.play_task is {self.task}, but its actuators are not those of "
+                    f"{config.env}; choose a task of the same body."
                 )
         played = (self.task, None) if self.task else (config.env, config.goal)
         self.played = resolve_task(*played).env_id
@@ -77,7 +77,7 @@ class SAR(Method):
             raise ValueError(
                 f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "
                 f"simulators need {needed} for two whole episodes of {steps} steps, and SAR takes "
-                "the best of whole episodes; give more."
+                "the best of whole episodes; raise it."
             )
 
     @property

@@ -67,7 +67,7 @@ class Checkpoints(CheckpointRotation):
             if fault is None:
                 return folder
             warnings.warn(
-                f"Checkpoint {folder} is damaged ({fault}); falling back to the one before.",
+                f"Checkpoint {folder} is damaged ({fault}); using the one before.",
                 stacklevel=2,
             )
         return None
@@ -85,7 +85,7 @@ class Checkpoints(CheckpointRotation):
                 checkpoint.load(folder)
             except CheckpointError as error:
                 raise OSError(
-                    f"Checkpoint {folder} does not fit the run as it is configured now ({error}); "
+                    f"Checkpoint {folder} does not fit the run's current settings ({error}); "
                     "resume without the settings that were changed."
                 ) from error
         elif self.checkpoints():
@@ -139,7 +139,7 @@ def _fault(folder: Path) -> str | None:
         return f"{_SEAL} holds no digests"
     foreign = [name for name in sealed if Path(name).suffix not in _PLAIN_FILES]
     if foreign:
-        return f"{foreign[0]} is not a kind of file that a checkpoint holds"
+        return f"{foreign[0]} is not a kind of file in checkpoints"
     names = sorted(found.keys() | sealed.keys())
     other = next((name for name in names if found.get(name) != sealed.get(name)), None)
-    return None if other is None else f"{other} is not as it was written"
+    return None if other is None else f"{other} has changed since it was saved"

@@ -108,11 +108,11 @@ def validate(config: DictConfig) -> None:
     """
     for name in ("env", "run_dir", "device"):
         if not isinstance(config[name], str) or not config[name]:
-            raise ValueError(f"{name} is {config[name]!r}; it must be a text.")
+            raise ValueError(f"{name} is {config[name]!r}; it must be a string.")
     for name in ("env_kwargs", "logger_kwargs"):
         if not isinstance(config[name], Mapping):
             raise ValueError(
-                f"{name} is {config[name]!r}; it must be arguments by name, such as "
+                f"{name} is {config[name]!r}; it must map names to values, such as "
                 f"{name}={{NAME: VALUE}}."
             )
     if config.compile not in (None, True, False):
@@ -225,8 +225,8 @@ def bfloat16_warning(config: DictConfig) -> str | None:
     if any(has.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")):
         return None
     return (
-        "this processor has no instructions for bfloat16, so body=residual_bfloat16 takes longer "
-        "than the same in float32, body=residual."
+        "this processor has no bfloat16 instructions, so body=residual_bfloat16 is slower than "
+        "body=residual, the same in float32."
     )
 
 
@@ -235,9 +235,9 @@ def _check_collector(collector: DictConfig) -> None:
     workers = collector.num_workers if collector.kind == "process" else 1
     if collector.frames_per_batch % (workers * collector.num_envs):
         raise ValueError(
-            f"collector.frames_per_batch is {collector.frames_per_batch} and a batch comes from "
+            f"collector.frames_per_batch is {collector.frames_per_batch}, but a batch comes from "
             f"{workers} x {collector.num_envs} environments (workers x collector.num_envs); it "
-            "must be a multiple of their number, since every environment gives as many frames."
+            "must be a multiple of their number, as each gives the same number of frames."
         )
     if collector.kind == "ray" and find_spec("ray") is None:
         raise ValueError(

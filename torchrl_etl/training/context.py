@@ -137,8 +137,8 @@ class Context:
         slow = [type(each).__name__ for each in env_transforms if not VectorCollector.takes(each)]
         if num_envs > 1 and slow:
             warnings.warn(
-                f"Frames come through TorchRL's Collector, which is several times slower, since "
-                f"{', '.join(slow)} has no array_step and array_reset (see VectorCollector).",
+                "Frames are collected with TorchRL's Collector, which is several times slower, "
+                f"since {', '.join(slow)} has no array_step and array_reset (see VectorCollector).",
                 stacklevel=2,
             )
         fast = num_envs > 1 and not slow

@@ -150,9 +150,8 @@ def _refuse_lost_checkpoints(stage: Stage, folder: RunFolder) -> None:
     """Raise rather than overwrite the logs of a stage whose checkpoints are missing."""
     if stage.name in (saved := folder.saved):
         raise OSError(
-            f"{folder.path} was saved at frame {saved[stage.name]} of stage {stage.name!r} and "
-            f"holds none of its checkpoints; copy checkpoints/{stage.name} back, or start a new "
-            "run."
+            f"{folder.path} was saved at frame {saved[stage.name]} of stage {stage.name!r} but has "
+            f"no checkpoint of it; copy checkpoints/{stage.name} back, or start a new run."
         )
 
 

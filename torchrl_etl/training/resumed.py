@@ -56,14 +56,14 @@ def resumed_config(
     keys = {override.key_or_group for override in parsed}
     over = surviving_folder(Path(folder) / "synergies").exists()
     if over and (late := sorted(key for key in keys if key.startswith("explore."))):
-        raise ValueError(f"{folder} has its synergies already; leave {late[0]} out.")
+        raise ValueError(f"{folder} already has its synergies; leave {late[0]} out.")
     if {"frames", "learn.frames"} <= keys:
-        raise ValueError("frames and learn.frames were given, and each sets the budget; give one.")
+        raise ValueError("frames and learn.frames both set the budget; pass only one of them.")
     if "learn.frames" in keys:  # the setting given now takes precedence
         config.frames = None
     if taken := [f"{key}={value}" for key, value in newer.items() if key not in keys]:
         warnings.warn(
-            f"{folder} is of a release that did not have {', '.join(taken)}; these defaults hold.",
+            f"{folder} is of a release without {', '.join(taken)}; these defaults are used.",
             stacklevel=2,
         )
     OmegaConf.set_struct(config, True)
@@ -91,9 +91,9 @@ def check_prefix(override: Override, known: bool) -> None:
     """
     key = override.key_or_group
     if override.is_delete():
-        raise ValueError(f"~{key} would take a setting away, which a run needs; give it a value.")
+        raise ValueError(f"~{key} would remove a setting that a run needs; give it a value.")
     if known and override.is_add() and not override.is_force_add():
-        raise ValueError(f"+{key} is a setting that is there already; leave the plus out.")
+        raise ValueError(f"+{key} is a setting that already exists; leave out the plus.")
 
 
 def _stored(path: Path) -> DictConfig:
@@ -115,8 +115,8 @@ def _stored(path: Path) -> DictConfig:
         config.method.kind = config.method.pop("learner")
     if old := [key for key in RENAMED if OmegaConf.select(config, key) is not None]:
         raise ValueError(
-            f"{path} is of a release whose settings had other names ({old[0]}, now "
-            f"{RENAMED[old[0]]}); go on with that release, or start a new run."
+            f"{path} is of a release in which settings had other names ({old[0]}, now "
+            f"{RENAMED[old[0]]}); continue with that release, or start a new run."
         )
     return config
 

@@ -64,7 +64,7 @@ class RunFolder:
                 self._lock.release()
                 setting = shlex.quote(f"resume={self.path}")  # as a shell takes it
                 raise _HoldsARun(
-                    f"{self.path} already holds a run; go on with it by {setting}, or choose "
+                    f"{self.path} already holds a run; continue it with {setting}, or choose "
                     "another run_dir."
                 )
             write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
@@ -72,12 +72,12 @@ class RunFolder:
             raise
         except Timeout:
             raise FileExistsError(
-                f"Another process is at work in {self.path}; wait for it, or stop it."
+                f"Another process uses {self.path}; wait for it, or stop it."
             ) from None
         except OSError as error:
             raise OSError(
                 f"The run folder {self.path} cannot be written ({error.strerror}); choose another "
-                "run_dir or mend its permissions."
+                "run_dir or fix its permissions."
             ) from error
         # One entry per start: a run may be resumed on another machine or commit.
         self.write_json("versions.json", [*self.versions, {**facts(), "saved": self.saved}])
@@ -158,8 +158,8 @@ class RunFolder:
         except OSError as error:
             setting = shlex.quote(f"resume={self.path}")
             raise OSError(
-                f"What {self.path} logs cannot be written ({error.strerror or error}); mend that, "
-                f"then go on with {setting}."
+                f"The log of {self.path} cannot be written ({error.strerror or error}); fix that, "
+                f"then continue with {setting}."
             ) from error
 
     def series(self, key: str) -> tuple[list[int], list[float]]:
@@ -198,7 +198,7 @@ class RunFolder:
         path = self.path / name
         if not path.exists():
             return default
-        return read_json(path, type(default), OSError, "move it away to go on without it")
+        return read_json(path, type(default), OSError, "move it away to continue without it")
 
 
 def _claimed(path: Path) -> Path:
@@ -257,5 +257,5 @@ def _read(path: Path) -> list[tuple[int, float]]:
         return [(int(frame), float(value)) for frame, value in rows]
     except ValueError as error:
         raise OSError(
-            f"{path} is damaged ({error}); move it away to go on without what it logged."
+            f"{path} is damaged ({error}); move it away to continue without what it logged."
         ) from error

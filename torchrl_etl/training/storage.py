@@ -28,6 +28,8 @@ class ReservedMemmapStorage(LazyMemmapStorage):
         try:
             super()._init(data)
         except RuntimeError as error:  # raised by PyTorch if a file cannot be this large
-            raise OSError(f"A buffer has no room in {self.scratch_dir}: {error}") from error
+            raise OSError(
+                f"There is no room for a buffer in {self.scratch_dir}: {error}"
+            ) from error
         for file in Path(self.scratch_dir).rglob("*.memmap"):
             reserve(file)

@@ -86,8 +86,8 @@ class Run:
         begun = path.read_text("utf-8").splitlines() if path.is_file() else asked
         if self.has_begun and (other := sorted(set(begun) ^ set(asked))):
             raise ValueError(
-                f"{self.path} was begun with other settings ({', '.join(other)}); give another "
-                "out=FOLDER, or the settings that it was begun with."
+                f"{self.path} was started with other settings ({', '.join(other)}); pass another "
+                "out=FOLDER, or the settings that it was started with."
             )
 
     @property
@@ -230,7 +230,7 @@ class Sweep:
             self._lock.acquire(timeout=0)
         except Timeout:
             raise RuntimeError(
-                f"Another queue works in {self.folder}; wait for it, or give another folder."
+                f"Another queue uses {self.folder}; wait for it, or pass another folder."
             ) from None
         # Rows of earlier queues, perhaps copied from other machines without the run folders.
         own = {run.key for run in runs}

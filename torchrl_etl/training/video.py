@@ -64,7 +64,7 @@ def check_video_size(size: Sequence[int], *, episodes: int = 1, sides: int = 1) 
     if max(height, width) > _MOST_PIXELS:
         raise ValueError(
             f"video_size={numbers!r} and video_episodes={episodes} make a picture of {height} by "
-            f"{width} pixels, which is more than {_MOST_PIXELS}; choose fewer or smaller ones."
+            f"{width} pixels; each side must be at most {_MOST_PIXELS}, so lower one of them."
         )
     return numbers[0], numbers[1]
 
