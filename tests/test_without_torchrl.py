@@ -141,7 +141,7 @@ def test_a_policy_function_is_the_policy_without_noise():
     np.testing.assert_allclose(act(seen), written["loc"].detach().tanh(), atol=1e-6)
     np.testing.assert_array_equal(act(seen), act(seen.tolist()))
     np.testing.assert_allclose(act(seen[0]), act(seen)[0], atol=1e-6)
-    with pytest.raises(ValueError, match="write 'synergy', otherwise pass other keys"):
+    with pytest.raises(ValueError, match="write 'synergy'; otherwise pass other keys"):
         policy_function(actor, action_key="synergy")
 
 
