@@ -62,13 +62,13 @@ def main(config: DictConfig) -> None:
             config.video_size, episodes=config.video_episodes, sides=1 + config.video_before
         )
         if (config.run is None) == (config.zoo is None):
-            named = "no run is named" if config.run is None else "a run and an entry are named"
+            named = "no run is given" if config.run is None else "both run and zoo are given"
             raise ValueError(
                 f"{named}; pass run=PATH, the folder that etl_sac.py printed, or zoo=NAME."
             )
         if config.env is not None and config.zoo is None:
             raise ValueError(
-                "env is the task of an entry of the zoo; a run has its own, so leave it out."
+                "env is only for an entry of the zoo; a run has its own task, so leave it out."
             )
         trained = of_a_run(config) if config.zoo is None else of_the_zoo(config)
         recorder = open_recorder(config, trained.env, size) if config.video else None
@@ -156,11 +156,11 @@ def beside(card: zoo.Card, evaluation: Evaluation) -> str:
     pairs = list(zip(told, evaluation.returns, strict=False))
     same = sum(math.isclose(one, other, rel_tol=1e-4, abs_tol=1e-4) for one, other in pairs)
     if same == len(pairs):
-        return f"as its card says, in each of {same} episodes"
+        return f"same return as on its card in each of {same} episodes"
     mean, low, high = card.evaluation["return"].values()
     return (
-        f"{len(pairs) - same} of {len(pairs)} episodes are not those of its card, whose return is "
-        f"{mean:.3f} ({low:.3f} to {high:.3f}); another machine or simulator rounds otherwise"
+        f"{len(pairs) - same} of {len(pairs)} episodes differ from its card, which has the return "
+        f"{mean:.3f} ({low:.3f} to {high:.3f}); other machines and simulators round differently"
     )
 
 

@@ -40,7 +40,7 @@ def main(config: DictConfig) -> None:
     compose = partial(hydra.compose, "config")
     with exit_on_error(*OPENING_ERRORS):
         if config.run is None:
-            raise ValueError("no run is named; pass run=PATH, the folder that etl_sac.py printed.")
+            raise ValueError("no run is given; pass run=PATH, the folder that etl_sac.py printed.")
         check_choice("part", config.part, ("all", "synergies"))
         check_integer(1, episodes=config.episodes)
         if "/" in str(config.name) or str(config.name) in (".", ".."):
@@ -52,7 +52,7 @@ def main(config: DictConfig) -> None:
         target = Path(config.out or f"zoo/{name}").expanduser()
         if config.part == "synergies":
             setting = shlex.quote(f"synergies=zoo:{copy_bundle(run, target)}")
-            print(f"Synergies of {trained.env}, for {setting}")
+            print(f"Synergies of {trained.env}; to use them: {setting}")
             return
         card = export_run(run, target, compose, CONF, episodes=config.episodes)
     size = sum(path.stat().st_size for path in target.iterdir())

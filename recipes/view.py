@@ -41,13 +41,13 @@ def main(config: DictConfig) -> None:
         check_port(config.host, config.port)
         session = Session(open_subject(config))
         page = Page(session, host=config.host, port=config.port, say=print)
-    print(f"{session.subject.name} is shown at {page.address} (Ctrl-C ends it)", flush=True)
+    print(f"{session.subject.name} is shown at {page.address} (Ctrl-C to stop)", flush=True)
     for number in (signal.SIGINT, signal.SIGTERM):  # also in the background, where & ignores them
         signal.signal(number, signal.default_int_handler)
     try:
         page.run()
     except KeyboardInterrupt:
-        print("The viewer has ended.")
+        print("The viewer has stopped.")
 
 
 def open_subject(config: DictConfig) -> Subject:
@@ -55,13 +55,13 @@ def open_subject(config: DictConfig) -> Subject:
     named = [source for source in SOURCES if config[source] is not None]
     if len(named) != 1:
         raise ValueError(
-            f"{' and '.join(named) or 'nothing to look at'} {'were' if named else 'was'} named; "
+            f"{' and '.join(named) or 'nothing to view'} {'were' if named else 'was'} given; "
             "pass run=PATH, the folder that etl_sac.py printed, zoo=NAME, or bundle=PATH env=TASK."
         )
     # For an entry, env= gives the module of its task, which the entry itself may not import.
     own = {"run": ["env", "goal"], "zoo": ["goal"], "bundle": []}[named[0]]
     if given := [setting for setting in own if config[setting] is not None]:
-        raise ValueError(f"{named[0]} has a task of its own; leave {' and '.join(given)} out.")
+        raise ValueError(f"{named[0]} has its own task; leave {' and '.join(given)} out.")
     if named == ["zoo"]:
         return open_zoo(config.zoo, config.env)
     if named == ["run"]:

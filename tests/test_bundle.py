@@ -121,7 +121,7 @@ DAMAGE = {
     r"safetensors cannot be read \(No such file": lambda f: (f / "synergies.safetensors").unlink(),
     r"synergies\.json cannot be read \(No such file": lambda f: (f / "synergies.json").unlink(),
     "is not JSON": lambda f: (f / "synergies.json").write_text("{"),
-    r"synergies\.json holds no JSON object": lambda f: (f / "synergies.json").write_text("[1]"),
+    r"synergies\.json is not a JSON object": lambda f: (f / "synergies.json").write_text("[1]"),
     "does not describe a synergy bundle": lambda f: (f / "synergies.json").write_text("{}"),
     "format version 3 and this torchrl_etl reads 1 and 2": lambda f: edit(f, format_version=3),
     r"lacks \['task'\]": lambda f: edit(f, task=None),

@@ -139,7 +139,7 @@ def test_bundle_cannot_import_a_module(finished, tmp_path):
     info = json.loads((folder / "synergies.json").read_text())
     info["task"] = "antigravity:T-v0"
     (folder / "synergies.json").write_text(json.dumps(info))
-    with pytest.raises(BundleError, match=r"does not get to import .*; pass env=\S+ yourself"):
+    with pytest.raises(BundleError, match=r"files may not import .*; pass env=\S+ yourself"):
         open_bundle(folder)
     assert "antigravity" not in sys.modules
     assert open_bundle(folder, "overactuated").task.name == "overactuated"
@@ -148,7 +148,7 @@ def test_bundle_cannot_import_a_module(finished, tmp_path):
 def test_a_bundle_of_a_recording_is_shown_on_the_task_that_is_named(tmp_path):
     muscles = actuator_names("overactuated")
     folder = save_bundle(SynergyDecoder(2, 16), tmp_path / "a", task="emg", actuators=muscles)
-    with pytest.raises(BundleError, match="is of 'emg', which is no task; pass env=TASK"):
+    with pytest.raises(BundleError, match="is of 'emg', which is not a known task; pass env=TASK"):
         open_bundle(folder)
     assert open_bundle(folder, "overactuated").task.name == "overactuated"
 
@@ -206,10 +206,10 @@ def recipe():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "nothing to look at was named; pass run=PATH"),
-        ({"run": "a", "bundle": "b"}, "run and bundle were named"),
-        ({"run": "a", "env": "dog-run"}, "run has a task of its own; leave env out"),
-        ({"zoo": "a", "goal": "random"}, "zoo has a task of its own; leave goal out"),
+        ({}, "nothing to view was given; pass run=PATH"),
+        ({"run": "a", "bundle": "b"}, "run and bundle were given"),
+        ({"run": "a", "env": "dog-run"}, "run has its own task; leave env out"),
+        ({"zoo": "a", "goal": "random"}, "zoo has its own task; leave goal out"),
         ({"bundle": "nowhere"}, "no synergy bundle at 'nowhere'"),
     ],
 )
@@ -240,6 +240,6 @@ def test_view_serves_the_printed_address_until_ctrl_c(tmp_path):
         with urlopen(re.search(r"http://[\d.:]+", line)[0]) as page:
             assert b"<html" in page.read()
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0 and "has ended" in process.stdout.read()
+        assert process.wait(60) == 0 and "has stopped" in process.stdout.read()
     finally:
         process.kill()

@@ -42,5 +42,5 @@ def test_json_of_the_wrong_type_is_named(
     kind: type, word: str, content: str, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text(content)
-    with pytest.raises(OurError, match=f"file holds no JSON {word}; mend it"):
+    with pytest.raises(OurError, match=f"file is not a JSON {word}; mend it"):
         read_json(tmp_path / "file", kind, OurError, "mend it")

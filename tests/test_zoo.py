@@ -179,7 +179,7 @@ def test_actor_that_its_method_does_not_describe_is_refused(monkeypatch):
     experiment = Experiment(tiny(ELBOW, "method=lattice", "run_dir=unused"))
     learner = experiment.method.stage().learner
     monkeypatch.setattr(experiment.method, "actor", lambda: {"kind": "gaussian"})
-    with pytest.raises(ValueError, match="its method must say which actor it has"):
+    with pytest.raises(ValueError, match="its method must describe its actor"):
         rebuilt(learner.policy, describe_policy(experiment, learner))
 
 
@@ -265,16 +265,16 @@ def swap_weights(entry, value=0.0):
         (lambda entry: cut(entry / "policy.safetensors"), "SHA-256 is not the one in card.json"),
         (lambda entry: (entry / "policy.safetensors").unlink(), "cannot be read"),
         (lambda entry: cut(entry / "card.json"), "is not JSON"),
-        (lambda entry: (entry / "card.json").write_text("[]"), "holds no JSON object"),
+        (lambda entry: (entry / "card.json").write_text("[]"), "is not a JSON object"),
         (lambda entry: rewrite(entry, format_version=9), "format_version 9"),
-        (lambda entry: rewrite(entry, policy=[]), "not what belongs to 'policy'"),
-        (lambda entry: rewrite(entry, more=1), "not what belongs to 'more'"),
+        (lambda entry: rewrite(entry, policy=[]), "'policy' in .* is missing, unknown or invalid"),
+        (lambda entry: rewrite(entry, more=1), "'more' in .* is missing, unknown or invalid"),
         (lambda entry: rewrite(entry, policy={}), "describes no policy"),
         (lambda entry: rewrite(entry, task={"name": "myoHand"}), "names no task"),
         (lambda entry: rewrite(entry, actuators=["a"] * 16), "not the environment's 16"),
         (lambda entry: rewrite(entry, actuators=[]), "moves 0 actuators"),
-        (lambda entry: rewrite(entry, task={"name": "antigravity:T-v0"}), "does not get to import"),
-        (swap_weights, "are not those of the policy"),
+        (lambda entry: rewrite(entry, task={"name": "antigravity:T-v0"}), "files may not import"),
+        (swap_weights, "do not fit the policy"),
         (lambda entry: swap_weights(entry, torch.nan), "weight of .* is not finite"),
         (lambda entry: shutil.rmtree(entry), "The zoo has no"),
         (lambda entry: (entry / "card.json").unlink(), "holds synergies alone"),
@@ -304,7 +304,7 @@ def test_export_and_evaluate_commands(run, tmp_path, monkeypatch, capsys):
     assert command("export.py", f"run={run}", "name=toy", "episodes=2") == 0
     assert "zoo.load('zoo/toy')" in capsys.readouterr().out
     assert command("evaluate.py", "zoo=zoo/toy", "episodes=2") == 0
-    assert "as its card says, in each of 2 episodes" in capsys.readouterr().out
+    assert "same return as on its card in each of 2 episodes" in capsys.readouterr().out
     assert (tmp_path / "runs" / "zoo-toy" / "evaluation.json").is_file()
     assert command("export.py", f"run={run}", "part=synergies", "out=hand") == 0
     assert zoo.synergies("hand").name == "hand"
@@ -323,7 +323,7 @@ def test_entry_of_a_custom_task_requires_env_from_the_user(exported, tmp_path, m
     assert command("evaluate.py", "zoo=toy", "episodes=1") != 0
     assert "if you trust it, pass env=own_toys:OwnToy-v0" in capsys.readouterr().err
     assert command("evaluate.py", "zoo=toy", "env=own_toys:OwnToy-v1", "episodes=1") != 0
-    assert "is 'own_toys:OwnToy-v0' and not 'own_toys:OwnToy-v1'" in capsys.readouterr().err
+    assert "is 'own_toys:OwnToy-v0', not 'own_toys:OwnToy-v1'" in capsys.readouterr().err
     assert "own_toys" not in sys.modules
     assert command("evaluate.py", "zoo=toy", "env=own_toys:OwnToy-v0", "episodes=1") == 0
     assert open_zoo("toy", "own_toys:OwnToy-v0").drivers[0] == "policy"
@@ -333,15 +333,15 @@ def test_entry_of_a_custom_task_requires_env_from_the_user(exported, tmp_path, m
 @pytest.mark.parametrize(
     ("recipe", "arguments", "words"),
     [
-        ("export.py", [], "no run is named"),
+        ("export.py", [], "no run is given"),
         ("export.py", ["run=nowhere"], "holds no run"),
-        ("export.py", ["run=explored"], "holds no whole checkpoint of stage 2"),
+        ("export.py", ["run=explored"], "has no complete checkpoint of stage 2"),
         ("export.py", ["run=explored", "part=policy"], "part is 'policy'; choose one of"),
         ("export.py", ["run=explored", "name=../pen"], "name is '../pen'; it must not be a path"),
         ("export.py", ["run=explored", "name=.."], "name is '..'; it must not be a path"),
         ("evaluate.py", ["zoo=overactuted"], "nearest: overactuated"),
-        ("evaluate.py", ["zoo=a", "run=b"], "a run and an entry are named"),
-        ("evaluate.py", ["run=b", "env=a"], "env is the task of an entry of the zoo"),
+        ("evaluate.py", ["zoo=a", "run=b"], "both run and zoo are given"),
+        ("evaluate.py", ["run=b", "env=a"], "env is only for an entry of the zoo"),
         ("evaluate.py", ["zoo=overactuated", "device=gpu"], "device is 'gpu'; use cpu, cuda or"),
         ("etl_sac.py", ["synergies=zoo:nowhere", "env=overactuated"], "The zoo has no 'nowhere'"),
     ],

@@ -117,8 +117,8 @@ def rebuilt(policy: TensorDictModuleBase, described: dict[str, Any]) -> TensorDi
         again.load_state_dict(policy.state_dict())
     except RuntimeError as error:
         raise ValueError(
-            "The policy of this run is not one that the zoo can build again "
-            f"({' '.join(str(error).split())[:200]}); its method must say which actor it has."
+            "The zoo cannot rebuild the policy of this run "
+            f"({' '.join(str(error).split())[:200]}); its method must describe its actor."
         ) from error
     return again.to(torch.device("cpu"))
 

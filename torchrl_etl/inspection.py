@@ -48,8 +48,8 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
     subject = _with_explorer(_with_policy(subject, experiment), experiment)
     if not subject.drivers:
         raise ValueError(
-            f"{run} holds neither a policy (no whole checkpoint of a stage) nor synergies; view a "
-            "run that has saved its first checkpoint."
+            f"{run} has neither a policy (no complete checkpoint of a stage) nor synergies; view "
+            "a run that has saved its first checkpoint."
         )
     return subject
 
@@ -80,8 +80,8 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None
             resolve_task(env)
         except ValueError as error:  # of a recording, say
             raise BundleError(
-                f"The bundle {bundle} is of {info.task!r}, which is no task; pass env=TASK, one of "
-                "its body."
+                f"The bundle {bundle} is of {info.task!r}, which is not a known task; pass "
+                "env=TASK, a task of the same body."
             ) from error
     task = resolve_task(env, goal)
     spec = EnvironmentSpec.of(make_env(env, goal=goal))

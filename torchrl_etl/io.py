@@ -55,7 +55,7 @@ def read_json(path: Path, kind: type[Content], error: type[Exception], cure: str
     except (ValueError, RecursionError) as fault:
         raise error(f"{path} is not JSON ({fault}); {cure}.") from fault
     if not isinstance(content, kind):
-        raise error(f"{path} holds no JSON {'array' if kind is list else 'object'}; {cure}.")
+        raise error(f"{path} is not a JSON {'array' if kind is list else 'object'}; {cure}.")
     return content
 
 
@@ -80,7 +80,7 @@ def replaceable_folder(
         held = "is a file" if folder.exists() else ""
     if held:
         raise error(
-            f"{folder} {held}, and saving {what} there would remove it; choose a folder of its own."
+            f"{folder} {held}, and saving {what} there would remove it; choose another folder."
         )
     return folder
 
@@ -214,5 +214,5 @@ def _allocate(file: IO[bytes], size: int, folder: Path) -> None:
     except OSError as error:
         raise OSError(
             f"There is no room for {size / 1e6:,.1f} MB in {folder} ({error.strerror}); free "
-            "some space there, or let the run have a folder on another disk."
+            "some space there, or use a run folder on another disk."
         ) from error

@@ -28,14 +28,12 @@ def check_imported(name: object, source: str, error: type[ValueError], remedy: s
         >>> check_imported("fractals:T-v0", "The task of my_file", ValueError, "import it")
         Traceback (most recent call last):
         ...
-        ValueError: The task of my_file is 'fractals:T-v0', and a file does not get to import
+        ValueError: The task of my_file is 'fractals:T-v0', and files may not import
         'fractals'; import it.
     """
     module = str(name).rpartition(":")[0]
     if module and module not in sys.modules:
-        raise error(
-            f"{source} is {name!r}, and a file does not get to import {module!r}; {remedy}."
-        )
+        raise error(f"{source} is {name!r}, and files may not import {module!r}; {remedy}.")
 
 
 def find_class(kind: str, kinds: Mapping[str, type[T]], base: type[T]) -> type[T]:

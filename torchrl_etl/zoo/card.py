@@ -63,7 +63,7 @@ class Card:
         version = content.get("format_version")
         if version != FORMAT_VERSION:
             raise ZooError(
-                f"{path} has format_version {version!r} where this torchrl_etl reads "
+                f"{path} has format_version {version!r}, but this torchrl_etl reads "
                 f"{FORMAT_VERSION}; load it with the release that wrote it."
             )
         known = {item.name: item.type for item in fields(cls)}
@@ -73,5 +73,7 @@ class Card:
             if type(value).__name__ != known[name].partition("[")[0]
         ]
         if odd:
-            raise ZooError(f"{path} has not what belongs to {odd[0]!r}; copy the entry again.")
+            raise ZooError(
+                f"{odd[0]!r} in {path} is missing, unknown or invalid; copy the entry again."
+            )
         return cls(**content)

@@ -92,8 +92,8 @@ def read_card(name: str | os.PathLike[str]) -> Card:
     if not (folder / CARD).exists():
         held = "synergies alone" if synergies_alone(folder) else "no entry of the zoo"
         raise ZooError(
-            f"{folder} holds {held}; pass an entry with a policy, of which {CARD} and {WEIGHTS} "
-            "are parts."
+            f"{folder} holds {held}; pass an entry with a policy, that is, with {CARD} and "
+            f"{WEIGHTS}."
         )
     return Card.read(folder)
 
@@ -216,7 +216,9 @@ def trust(name: str | os.PathLike[str], env: str) -> None:
         ZooError: if ``env`` is not the entry's task.
     """
     if env != (task := read_card(name).task.get("name")):
-        raise ZooError(f"The task of {find(name)} is {task!r} and not {env!r}; pass that.")
+        raise ZooError(
+            f"The task of {find(name)} is {task!r}, not {env!r}; pass env={task} instead."
+        )
     resolve_task(env)
 
 
@@ -285,8 +287,8 @@ def _fill(
         policy.load_state_dict(state)
     except RuntimeError as error:
         raise ZooError(
-            f"The weights of {folder} are not those of the policy that its {CARD} describes "
-            f"({' '.join(str(error).split())[:200]}); both must be of one run and one release."
+            f"The weights of {folder} do not fit the policy that its {CARD} describes "
+            f"({' '.join(str(error).split())[:200]}); both must be of the same run and release."
         ) from error
     return policy
 
@@ -318,6 +320,6 @@ def _check_env(folder: Path, card: Card, found: EnvironmentSpec) -> None:
         theirs = getattr(found, side).cpu().numpy()
         if not np.allclose(made[side], theirs):
             raise ZooError(
-                f"{has} has other {side} action bounds than the environment; the action is scaled "
-                "otherwise, so use the release of its simulator that the card names."
+                f"{has} has other {side} action bounds than the environment; actions are scaled "
+                "differently, so use the release of its simulator that the card names."
             )

@@ -97,8 +97,8 @@ def describe_decoder(decoder: SynergyMap | None) -> dict[str, Any] | None:
     if type(decoder) is SARDecoder:
         return {"kind": "sar", "num_synergies": decoder.num_synergies, "blend": decoder.blend}
     raise ValueError(
-        f"The policy decodes with a {type(decoder).__name__}, which an entry of the zoo does not "
-        "hold; export runs that use SynergyDecoder or SARDecoder."
+        f"The policy decodes with a {type(decoder).__name__}, which zoo entries do not support; "
+        "export runs that use SynergyDecoder or SARDecoder."
     )
 
 
