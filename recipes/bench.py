@@ -2,4 +2,6 @@
 
 import sys
 
-sys.exit("Error: it is recipes/sweep.py now, with the same settings; out=bench goes on in bench/.")
+sys.exit(
+    "Error: bench.py is recipes/sweep.py now, with the same settings; out=bench continues there."
+)

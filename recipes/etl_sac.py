@@ -60,8 +60,8 @@ def main(config: DictConfig) -> None:
         apart = len(runs) > 1 and runs[0]["config"].device == "cpu"
         if len(runs) > 1 and not apart and runs[0]["config"].collector.kind == "distributed":
             raise ValueError(
-                "collector.kind is 'distributed', of which a process has one; on a GPU, where "
-                "several seeds share a process, use process or ray."
+                "collector.kind is 'distributed', which a process can have only once; on a GPU, "
+                "several seeds share a process, so use process or ray."
             )
         # All are built, and so checked, before the first begins. In processes, only those print.
         experiments = [
@@ -85,7 +85,7 @@ def main(config: DictConfig) -> None:
     if stopped:
         command = shlex.join(["python", sys.argv[0], resume_setting(stopped)])
         with suppress(OSError):  # the terminal may be gone
-            print(f"Stopped and saved. To go on: {command}", flush=True)
+            print(f"Stopped and saved. To continue: {command}", flush=True)
     if failures or stopped:
         sys.exit(130 if stopped else 2)
 
@@ -96,7 +96,7 @@ def configured_runs(config: DictConfig, given: list[str]) -> Iterator[dict[str, 
     if config.resume is not None:
         folders = config.resume if isinstance(config.resume, ListConfig) else [config.resume]
         if not folders:
-            raise ValueError("resume is []; name folders of runs, such as resume=runs/NAME.")
+            raise ValueError("resume is []; pass folders of runs, such as resume=runs/NAME.")
         defaults = hydra.compose("config")
         for folder in map(Path, folders):
             stored = resolve_collector(resumed_config(folder, given, defaults=defaults))
@@ -134,7 +134,7 @@ def report(summary: dict[str, Any], folder: Path) -> str:
             )
     if (folder / "pictures").exists():
         lines.append(f"  pictures    {folder / 'pictures'}")
-    return "\n".join([*lines, f"  all of it   {folder}"])
+    return "\n".join([*lines, f"  all files   {folder}"])
 
 
 if __name__ == "__main__":

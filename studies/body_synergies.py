@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--num-synergies", type=int, help="default: one for each joint")
     parser.add_argument("--rest", type=float, default=0.25, help="activation of coefficients 0")
     control = parser.add_mutually_exclusive_group()
-    control.add_argument("--shuffle", type=int, metavar="SEED", help="let muscles change places")
+    control.add_argument("--shuffle", type=int, metavar="SEED", help="permute the muscles")
     control.add_argument("--still", action="store_true", help="one synergy that moves no muscle")
     arguments = parser.parse_args()
     quiet_torchrl()

@@ -27,8 +27,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    parser.add_argument("--series", default="return", help="what of the log")
-    parser.add_argument("--stretch", type=int, default=25000, help="frames of a row")
+    parser.add_argument("--series", default="return", help="series of the log")
+    parser.add_argument("--stretch", type=int, default=25000, help="frames per row")
     parser.add_argument("--out", type=Path, required=True, help="CSV file to append to")
     arguments = parser.parse_args()
     for run in arguments.runs:
@@ -36,7 +36,9 @@ def main() -> None:
             config = OmegaConf.load(run / "config.yaml")
         folder = RunFolder(run, config)
         if not (starts := folder.versions):
-            parser.error(f"{run} does not say what it was made with; name a run that has begun.")
+            parser.error(
+                f"{run} does not record its commit and machine; pass a run that has begun."
+            )
         start = starts[-1]
         row = {"task": config.env, "method": config.method.name, "seed": config.seed}
         series = folder.series(f"learn/{arguments.series}")

@@ -53,8 +53,12 @@ def test_killed_process_and_sigint_are_reported_with_how_to_resume(tmp_path):
     running.send_signal(signal.SIGINT)
     output, _ = running.communicate(timeout=100)
     assert running.returncode == 130
-    assert f"The process of {folders[0]} ended with -9; go on with resume={folders[0]}." in output
-    assert f"Stopped and saved. To go on: python {ROOT}/recipes/etl_sac.py resume={folders[1]}" in (
-        output
+    assert (
+        f"The process of {folders[0]} ended with exit code -9; continue with resume={folders[0]}."
+        in output
+    )
+    assert (
+        f"Stopped and saved. To continue: python {ROOT}/recipes/etl_sac.py resume={folders[1]}"
+        in (output)
     )
     assert "Traceback" not in output

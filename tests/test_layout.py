@@ -63,7 +63,7 @@ def test_choose_layout_takes_and_names_the_fastest(speeds, fastest, kind, ahead)
     assert (chosen.collector.ahead, chosen.threads) == (ahead, fastest.threads)
     before, line = said
     assert before.startswith("collector=auto tries 4 ways to share the cores")
-    assert line.startswith(f"collector=auto takes {kind}, ") and "90" in line
+    assert line.startswith(f"collector=auto chose {kind}, ") and "90" in line
 
 
 def test_choose_layout_stays_in_one_process_if_the_gain_is_small(speeds):

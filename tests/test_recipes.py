@@ -146,7 +146,7 @@ def test_both_stages_run_on_a_gymnasium_id_and_with_paper_settings(options, tmp_
     ("recipe", "override", "words"),
     [
         ("etl_sac.py", "method=latice", "nearest: lattice"),
-        ("etl_sac.py", "method=pink", ", or give it a file of its own in ./conf/method."),
+        ("etl_sac.py", "method=pink", ", or add a file for it to ./conf/method."),
         ("etl_sac.py", "method.options.frames=5", "with method=etl there is no setting 'method.o"),
         ("etl_sac.py", "+exploration.std=5", "with exploration=metric there is no setting 'expl"),
         ("etl_sac.py", "enf=myoHandPose", "did you mean env"),
@@ -171,8 +171,8 @@ def test_both_stages_run_on_a_gymnasium_id_and_with_paper_settings(options, tmp_
         ("evaluate.py", "video_size=[a,b]", "two even whole numbers"),
         ("etl_sac.py", "myoHandPose", "not of the form key=value"),
         ("evaluate.py", "run=no (where)", "holds no run"),
-        ("etl_sac.py", "resume=[]", "resume is []; name folders of runs"),
-        ("evaluate.py", "episodes=3", "no run is named; pass run=PATH"),
+        ("etl_sac.py", "resume=[]", "resume is []; pass folders of runs"),
+        ("evaluate.py", "episodes=3", "no run is given; pass run=PATH"),
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],
 )

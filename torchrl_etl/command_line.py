@@ -80,8 +80,8 @@ def check_overrides(
         section = key.partition(".")[0]
         if argument in ("-m", "--multirun"):
             sys.exit(
-                f"Error: {argument} is not supported; recipes/sweep.py runs several, such as "
-                "methods=[sac,etl] seeds=[0,1], side by side, and goes on if it is interrupted."
+                f"Error: {argument} is not supported; recipes/sweep.py runs several side by side, "
+                "such as methods=[sac,etl] seeds=[0,1], and continues after an interruption."
             )
         if argument.startswith("-") or section == "hydra" or key.startswith("hydra/"):
             continue
@@ -203,7 +203,7 @@ def _check_file(conf: Path, group: str, choice: str) -> None:
         check_choice(group, choice, list(files))
     except ValueError as error:
         said = str(error).removesuffix(".")
-        raise ValueError(f"{said}, or give it a file of its own in ./conf/{group}.") from None
+        raise ValueError(f"{said}, or add a file for it to ./conf/{group}.") from None
 
 
 def _composed(config: Path, chosen: list[str]) -> tuple[DictConfig, Mapping[str, str]]:

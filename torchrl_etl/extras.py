@@ -23,14 +23,14 @@ def extra(name: str) -> Iterator[None]:
         ...     import not_installed
         Traceback (most recent call last):
         ...
-        ImportError: not_installed is needed here and not installed; pip install
-        'torchrl_etl[pictures]' brings it.
+        ImportError: not_installed is needed here but not installed; run pip install
+        'torchrl_etl[pictures]'.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         raise ImportError(
-            f"{error.name} is needed here and not installed; pip install 'torchrl_etl[{name}]' "
-            "brings it.",
+            f"{error.name} is needed here but not installed; run pip install "
+            f"'torchrl_etl[{name}]'.",
             name=error.name,
         ) from error

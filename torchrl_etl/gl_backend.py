@@ -26,7 +26,7 @@ def ignore_unusable_backend() -> None:
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
     if sys.platform != "linux" or backend in _TAKEN:
         return
-    fault = "it is no back end of MuJoCo; name egl, osmesa or glfw, or leave it unset"
+    fault = "it is not a MuJoCo backend; use egl, osmesa or glfw, or leave it unset"
     if backend in _LIBRARIES:
         library, package = _LIBRARIES[backend]
         if any(map(_opens, (f"{library}.so", *(f"{library}.so.{i}" for i in range(10))))):

@@ -104,5 +104,6 @@ def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
         folder = Path(run["resume"] or run["config"].run_dir)
         setting = shlex.quote(f"resume={folder}")
         return folder, ChildProcessError(
-            f"The process of {folder} ended with {process.exitcode}; go on with {setting}."
+            f"The process of {folder} ended with exit code {process.exitcode}; continue with "
+            f"{setting}."
         )

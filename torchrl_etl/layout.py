@@ -70,8 +70,7 @@ def choose_layout(
     """
     if config.seeds is not None:
         raise ValueError(
-            "collector=auto tries out one run but seeds asks for several at once; choose "
-            "collector=process."
+            "collector=auto measures one run but seeds asks for several; choose collector=process."
         )
     per_worker, batch = config.collector.num_envs, config.collector.frames_per_batch
     candidates = layouts(available_cores(), batch // per_worker, config.threads)
@@ -89,7 +88,7 @@ def choose_layout(
     if speeds[best] < CLEARLY_FASTER * speeds[candidates[0]]:
         best = candidates[0]
     found = "; ".join(f"{each}: {speed:.0f}" for each, speed in speeds.items())
-    say(f"collector=auto takes {best} (frames/s: {found})")
+    say(f"collector=auto chose {best} (frames/s: {found})")
     chosen = config.copy()
     chosen.threads = best.threads
     chosen.collector.update(best.collector)
