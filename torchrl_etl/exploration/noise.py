@@ -70,6 +70,9 @@ class LastingNoise(TensorDictModuleBase):
         True
     """
 
+    low: Tensor
+    high: Tensor
+
     def __init__(
         self, low: Tensor, high: Tensor, draw: HeldNormal | PinkNormal, *, std: float
     ) -> None:

@@ -35,7 +35,7 @@ class ActionDecoder(nn.Module):
         action_dim (int): number n of actuators.
 
     Keyword Args:
-        low, high (float or sequence of float): action bounds, in action units.
+        low, high (float, sequence of float or Tensor): action bounds, in action units.
         hidden (sequence of int): widths of the hidden layers. Default: ``(128, 128)``.
 
     Raises:
@@ -50,13 +50,16 @@ class ActionDecoder(nn.Module):
         (torch.Size([3, 5]), True)
     """
 
+    low: Tensor
+    high: Tensor
+
     def __init__(
         self,
         latent_dim: int,
         action_dim: int,
         *,
-        low: float | Sequence[float] = -1.0,
-        high: float | Sequence[float] = 1.0,
+        low: float | Sequence[float] | Tensor = -1.0,
+        high: float | Sequence[float] | Tensor = 1.0,
         hidden: Sequence[int] = (128, 128),
     ) -> None:
         super().__init__()
@@ -102,7 +105,7 @@ class GMVAE(nn.Module):
         num_components (int, optional): number C of mixture components. Default: d.
 
     Keyword Args:
-        low, high (float or sequence of float): action bounds. Default: ±1.
+        low, high (float, sequence of float or Tensor): action bounds. Default: ±1.
         hidden (sequence of int): widths of encoder and (reversed) decoder. Default: (128, 128).
 
     Raises:
@@ -125,8 +128,8 @@ class GMVAE(nn.Module):
         latent_dim: int,
         num_components: int | None = None,
         *,
-        low: float | Sequence[float] = -1.0,
-        high: float | Sequence[float] = 1.0,
+        low: float | Sequence[float] | Tensor = -1.0,
+        high: float | Sequence[float] | Tensor = 1.0,
         hidden: Sequence[int] = (128, 128),
     ) -> None:
         super().__init__()

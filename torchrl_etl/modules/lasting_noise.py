@@ -38,7 +38,7 @@ class HeldNormal:
         check_integer(1, longest=longest)
         self._chances = torch.arange(1, longest + 1, dtype=torch.float64).pow(-exponent)
         self._noise: Tensor | None = None
-        self._left: Tensor | None = None
+        self._left: Tensor
 
     def __call__(self, like: Tensor, is_init: Tensor) -> Tensor:
         """Noise [*, n] of this step in the dtype of ``like``; ``is_init`` [*] marks where an

@@ -37,6 +37,8 @@ class ReturnScale(RunningMoments):
         tensor([0.5000])
     """
 
+    largest: Tensor
+
     def __init__(self, gamma: float, *, bound: float = 5.0) -> None:
         super().__init__()
         check_real("[0, 1)", gamma=gamma)

@@ -25,6 +25,10 @@ class RunningDeviation(nn.Module):
         tensor(2.)
     """
 
+    mean: Tensor
+    variance: Tensor
+    weight: Tensor
+
     # Keeps the root mean square of divided values at 10 or less when they hardly vary.
     _FLOOR = 0.1
     _EPSILON = 1e-6

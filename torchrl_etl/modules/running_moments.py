@@ -26,6 +26,10 @@ class RunningMoments(nn.Module):
         (2.0, 1.0)
     """
 
+    count: Tensor
+    mean: Tensor
+    squares: Tensor
+
     def __init__(self, shape: Sequence[int] = ()) -> None:
         super().__init__()
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))

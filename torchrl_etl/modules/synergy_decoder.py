@@ -42,6 +42,9 @@ def percentile_box(coefficients: Tensor) -> tuple[Tensor, Tensor]:
 class _ScaledDecoder(nn.Module):
     """u ∈ [-1, 1]^d → Dec(center + scale·u), plus an optional bounded residual."""
 
+    center: Tensor
+    scale: Tensor
+
     def __init__(self, decoder: ActionDecoder, residual: float) -> None:
         super().__init__()
         self.decoder = decoder
@@ -83,7 +86,7 @@ class SynergyDecoder(SynergyMap):
         action_dim (int): number n of actuators.
 
     Keyword Args:
-        low, high (float or sequence of float): action bounds.
+        low, high (float, sequence of float or Tensor): action bounds.
         hidden (sequence of int): widths of the decoder's hidden layers.
         residual (float): ρ in [0, 1]. Default: 0 (no residual).
         in_keys (sequence of NestedKey): the coefficients. Default: ``("synergy",)``.
@@ -117,8 +120,8 @@ class SynergyDecoder(SynergyMap):
         num_synergies: int,
         action_dim: int,
         *,
-        low: float | Sequence[float] = -1.0,
-        high: float | Sequence[float] = 1.0,
+        low: float | Sequence[float] | Tensor = -1.0,
+        high: float | Sequence[float] | Tensor = 1.0,
         hidden: Sequence[int] = (128, 128),
         residual: float = 0.0,
         in_keys: Sequence[NestedKey] = ("synergy",),
@@ -204,8 +207,8 @@ class SynergyDecoder(SynergyMap):
         center: Tensor,
         directions: Tensor,
         *,
-        low: float | Sequence[float] = -1.0,
-        high: float | Sequence[float] = 1.0,
+        low: float | Sequence[float] | Tensor = -1.0,
+        high: float | Sequence[float] | Tensor = 1.0,
         residual: float = 0.0,
         **keys: Any,
     ) -> SynergyDecoder:

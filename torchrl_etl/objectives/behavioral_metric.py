@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +20,10 @@ from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners, targe
 
 __all__ = ["BehavioralMetricLoss"]
 
-_DISTANCES = {"l2": functional.l2_distance, "mico": functional.mico_distance}
+_DISTANCES: Mapping[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l2": functional.l2_distance,
+    "mico": functional.mico_distance,
+}
 
 
 class BehavioralMetricLoss(LossModule):
@@ -126,7 +130,7 @@ class BehavioralMetricLoss(LossModule):
     encoder: TensorDictModuleBase
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
-    dynamics: TensorDictModuleBase | None
+    dynamics: TensorDictModuleBase
     dynamics_params: TensorDictParams
     target_dynamics_params: TensorDictParams
 

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torchrl.objectives import SACLoss
 
 from torchrl_etl.objectives.checks import check_parts, warn_of_previous_action
 from torchrl_etl.objectives.sac import LeanSACLoss, call
@@ -86,7 +87,7 @@ class SynergySACLoss(LeanSACLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(LeanSACLoss._AcceptedKeys):
+    class _AcceptedKeys(SACLoss._AcceptedKeys):
         """SACLoss's keys; ``action`` is where the loss puts the coefficients it draws.
 
         Attributes:

@@ -36,6 +36,7 @@ class GMVAESynergies(SynergyModel):
     """
 
     kind = "gmvae"
+    loss: GMVAELoss
 
     def __init__(
         self,
@@ -68,8 +69,14 @@ class GMVAESynergies(SynergyModel):
 
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
         self.loss.reset_parameters_recursive()
-        options = {"updates": self.updates, "lr": self.lr, "on_update": on_update}
-        fit_gmvae(self.model, actions, loss=self.loss, **options)
+        fit_gmvae(
+            self.model,
+            actions,
+            updates=self.updates,
+            lr=self.lr,
+            loss=self.loss,
+            on_update=on_update,
+        )
 
     def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
         return SynergyDecoder.from_gmvae(self.model, actions, residual=residual)
@@ -101,8 +108,8 @@ def component_shares(gmvae: GMVAE, actions: Tensor | np.ndarray) -> Tensor:
     """
     actions = as_actions(actions, low=gmvae.low, high=gmvae.high)
     # In chunks: hidden layers of all actions at once would take far more memory than the result.
-    shares = sum(gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
-    return shares / len(actions)
+    totals = (gmvae.encode(part).logits.softmax(-1).sum(0) for part in actions.split(8192))
+    return sum(totals, torch.zeros(())) / len(actions)
 
 
 def fit_gmvae(
