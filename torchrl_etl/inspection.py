@@ -12,6 +12,7 @@ from torchrl.checkpoint import Checkpoint
 from torchrl_etl import zoo
 from torchrl_etl.analysis.viewer import Subject
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
+from torchrl_etl.envs.tasks import Goal
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import BundleError, check_compatible, load_bundle
@@ -54,7 +55,7 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
     return subject
 
 
-def open_bundle(bundle: Path, env: str | None = None, *, goal: str | None = None) -> Subject:
+def open_bundle(bundle: Path, env: str | None = None, *, goal: Goal | None = None) -> Subject:
     """The synergies of a bundle on a body.
 
     Opening a bundle imports no user module. Pass a task of your own as ``env``.

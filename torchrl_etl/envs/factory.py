@@ -196,7 +196,7 @@ def _raw_actuator_names(simulation: Any) -> list[str]:
     if hasattr(simulation, "actuator_names"):
         return [str(name) for name in simulation.actuator_names]
     if hasattr(simulation, "physics"):
-        model = simulation.physics.model
+        model: Any = simulation.physics.model
         return [model.id2name(i, "actuator") for i in range(model.nu)]
     model = getattr(simulation, "model", None)
     if not hasattr(model, "actuator"):
@@ -229,7 +229,9 @@ def _build(
     )
 
 
-def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
+def _simulator(
+    task: Task, env_kwargs: dict[str, Any]
+) -> tuple[gym.Env, tuple[type[Exception], ...]]:
     """Builds the environment with a flat action; also returns its errors for divergence."""
     if task.suite == "dm_control":
         suite = dm_control_suite()
@@ -239,7 +241,7 @@ def _simulator(task: Task, env_kwargs: dict[str, Any]) -> tuple[gym.Env, tuple]:
 
         domain, task_name = task.env_id.split("-", 1)
         env = DmControlCompatibilityV0(suite.load(domain, task_name, **env_kwargs))
-        faults = (PhysicsError,)
+        faults: tuple[type[Exception], ...] = (PhysicsError,)
     else:
         if task.suite == "myosuite":
             register_myosuite()

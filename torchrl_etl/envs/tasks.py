@@ -129,7 +129,7 @@ _BY_ID = {
     env_id: replace(task, goal=goal)
     for task in (*_PAPER, _MYO2, _ANALYTIC)
     if task.suite != "dm_control"
-    for goal, env_id in zip(("fixed", "random"), (task.id, task.random_id), strict=True)
+    for goal, env_id in zip(get_args(Goal), (task.id, task.random_id), strict=True)
     if env_id is not None
 }
 
@@ -261,7 +261,7 @@ def _by_its_spec(name: str, goal: Goal | None) -> Task:
     """A task known only from its id and Gymnasium's registry."""
     env_id = name.rpartition(":")[2]
     spec = gym.spec(env_id)
-    said = next((own for own in ("fixed", "random") if own.capitalize() in env_id), None)
+    said = next((own for own in get_args(Goal) if own.capitalize() in env_id), None)
     if said is not None and goal not in (None, said):
         raise ValueError(
             f"{name} already has the {said} goal, but goal={goal!r} was given; leave goal out."

@@ -20,6 +20,7 @@ from torchrl_etl.analysis.viewer.html import activation_grid, driven_list, statu
 from torchrl_etl.analysis.viewer.muscles import activations, driven_muscles
 from torchrl_etl.analysis.viewer.session import Session
 from torchrl_etl.envs import SimulationError
+from torchrl_etl.envs.tasks import Goal
 from torchrl_etl.extras import extra
 
 with extra("viewer"):
@@ -254,7 +255,7 @@ class Page:
     def _drive(self, name: str) -> None:
         self.session.drive(next(driver for driver, shown in _NAMES.items() if shown == name))
 
-    def _choose_goal(self, goal: str) -> None:
+    def _choose_goal(self, goal: Goal) -> None:
         self.session.choose_goal(goal)
         self._make_body()
 

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type, step_md
 
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.envs import HeldJoints, Task, has_free_root, mujoco_state, root_joints
+from torchrl_etl.envs.tasks import Goal
 from torchrl_etl.modules import SynergyMap
 
 __all__ = ["Driver", "Session", "Subject"]
@@ -53,7 +54,7 @@ class Subject:
 
     name: str
     task: Task
-    make_env: Callable[[str | None], EnvBase]
+    make_env: Callable[[Goal | None], EnvBase]
     actuators: Sequence[str]
     decoder: SynergyMap | None = None
     policy: TensorDictModuleBase | None = None
@@ -123,7 +124,7 @@ class Session:
         self._budget = self._settling = 0.0
         self._enter(subject.make_env(subject.task.goal), subject.task.goal)
 
-    def _enter(self, env: EnvBase, goal: str | None) -> None:
+    def _enter(self, env: EnvBase, goal: Goal | None) -> None:
         self.goal, self.env = goal, env
         try:
             self.model, self.data = mujoco_state(self.env)
@@ -175,7 +176,7 @@ class Session:
         self.drive("explorer")
         self.direction = torch.nn.functional.normalize(direction, dim=0)
 
-    def choose_goal(self, goal: str) -> None:
+    def choose_goal(self, goal: Goal) -> None:
         """Restart in a new simulator with the task's ``"fixed"`` or ``"random"`` goal.
 
         Raises:
