@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -29,7 +29,7 @@ from torchrl_etl.modules import (
 __all__ = ["Noise", "build_learner"]
 
 Noise = Literal["independent", "held"]
-Actor = ProbabilisticTensorDictSequential
+Actor: TypeAlias = ProbabilisticTensorDictSequential
 
 
 def build_learner(

@@ -139,15 +139,22 @@ class SACLearner:
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
         self.on_frames, self.on_restart = on_frames, on_restart
-        decoded = {"action_spec": action_spec, "decoder": decoder, "train_decoder": train_decoder}
-        entropy = {
-            "target_entropy": target_entropy,
-            "entropy_dims": entropy_dims,
-            "alpha_init": alpha_init,
-        }
-        critics = {"num_critics": num_critics, "bins": bins, "loss_function": loss_function}
         scale = make_return_scale(gamma, return_bound)
-        sac = make_loss(actor, critic, gamma, return_bound, **decoded, **entropy, **critics)
+        sac = make_loss(
+            actor,
+            critic,
+            gamma,
+            return_bound,
+            action_spec=action_spec,
+            decoder=decoder,
+            train_decoder=train_decoder,
+            target_entropy=target_entropy,
+            entropy_dims=entropy_dims,
+            alpha_init=alpha_init,
+            num_critics=num_critics,
+            bins=bins,
+            loss_function=loss_function,
+        )
         units = {"normalizer": normalizer, "return_scale": scale, "reward": reward}
         self.objective = Objective(sac, actor, terms, **units, transforms=transforms)
         self.objective.to(self.device)

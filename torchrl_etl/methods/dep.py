@@ -26,8 +26,10 @@ class DEP(Method):
     ``dep_frames`` counts the frames of all workers.
     """
 
-    takes = ("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau")
-    takes += ("bias_rate", "time_distance", "s4avg", "normalize")
+    takes = (
+        *("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau"),
+        *("bias_rate", "time_distance", "s4avg", "normalize"),
+    )
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")

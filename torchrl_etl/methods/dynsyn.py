@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.data import Bounded
 
 from torchrl_etl.baselines import (
@@ -97,7 +99,9 @@ class DynSyn(Method):
         with naming("method.options"):  # the actor checks them
             make_dynsyn_actor({"observation": 1}, spec, groups, **deviation)
 
-        def make_actor(inputs, spec, **options):
+        def make_actor(
+            inputs: Mapping[str, int], spec: Bounded, **options: Any
+        ) -> ProbabilisticTensorDictSequential:
             return make_dynsyn_actor(inputs, spec, groups, **options, **deviation)
 
         def entropy(spec: Bounded, action_std: float | None) -> float:

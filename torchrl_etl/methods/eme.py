@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential
+
 from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
 from torchrl_etl.checks import naming
 from torchrl_etl.learners import Term
@@ -38,7 +42,7 @@ class EME(Method):
             scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
             bonus = EMEBonus(encoder.to(device), ensemble.to(device), **scale)
 
-        def extra_options(actor):
+        def extra_options(actor: ProbabilisticTensorDictSequential) -> dict[str, Any]:
             gamma = self.context.config.learn.sac.gamma
             loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
             with naming("method.options", in_full=True):

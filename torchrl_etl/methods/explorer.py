@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
@@ -58,7 +59,7 @@ class Explorer:
         with naming("exploration"):
             terms = list(self.exploration.terms())
 
-        def extra_options(actor):
+        def extra_options(actor: ProbabilisticTensorDictSequential) -> dict[str, Any]:
             with naming("fit"):
                 self.selector = ActionSelector(actor, **fit)
             self.term = None

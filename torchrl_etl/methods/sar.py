@@ -46,8 +46,10 @@ class SAR(Method):
     ``blend`` of :class:`~torchrl_etl.baselines.SARDecoder`.
     """
 
-    takes = ("play_task", "frames", "rollout_frames", "preview_episodes", "percentile")
-    takes += ("num_synergies", "blend")
+    takes = (
+        *("play_task", "frames", "rollout_frames", "preview_episodes", "percentile"),
+        *("num_synergies", "blend"),
+    )
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -149,9 +151,8 @@ class SAR(Method):
         """A decoder of the right sizes, for use before play."""
         spec = self.context.spec
         blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
-        bounds = {"low": spec.low, "high": spec.high}
         with naming("method.options"):
-            return SARDecoder(blank[0], blank[1:], **bounds, blend=self.blend)
+            return SARDecoder(blank[0], blank[1:], low=spec.low, high=spec.high, blend=self.blend)
 
     def stage(self) -> Stage:
         decoder = self.decoder()
@@ -178,12 +179,12 @@ def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[Tenso
     rows: list[TensorDictBase] = []
     try:
         stage.start_collection()
-        yield
+        yield None
         stage.restart_collection()
         while stage.action_repeat * sum(map(len, rows)) < frames:
             check()
             stage.request()
-            yield
+            yield None
             batch = stage.batches.next().to(stage.device)
             rows.append(batch.select(*kept).set("episode", episode_numbers(batch)).reshape(-1))
     finally:

@@ -83,8 +83,10 @@ PRESETS = {
 
 _PLAIN = re.compile(r"[\w.-]*/[\w./-]*", re.ASCII)  # the slash rules out numbers, true and null
 
-_OF_A_STAGE = ("frames", "batch_size", "replay_ratio", "learning_starts")
-_OF_A_STAGE += ("buffer_size", "buffer_storage")
+_OF_A_STAGE = (
+    *("frames", "batch_size", "replay_ratio", "learning_starts"),
+    *("buffer_size", "buffer_storage"),
+)
 
 MAY_CHANGE = (
     *("frames", "stage", "restart_seed", "device", "threads", "compile"),

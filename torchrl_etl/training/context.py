@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Context"]
 
-NOT_OF_THE_STAGE = ("actor", "critic", "sac", "noise", "init_random_frames")  # the learner's
-NOT_OF_THE_STAGE += ("decoder", "prefill", "fit")  # the method's
+NOT_OF_THE_STAGE = (
+    *("actor", "critic", "sac", "noise", "init_random_frames"),  # the learner's
+    *("decoder", "prefill", "fit"),  # the method's
+)
 
 
 @dataclass(frozen=True)

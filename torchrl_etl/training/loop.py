@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
 
@@ -39,7 +39,7 @@ class StopOnSignal(AbstractContextManager):
 
     def __init__(self) -> None:
         self.requested = False
-        self._previous: dict[int, object] = {}
+        self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> StopOnSignal:
         for number in STOP_SIGNALS:
@@ -117,12 +117,12 @@ def run_stage(
         if not resumed and evaluate is not None:
             report.evaluation(evaluate())
         stage.start_collection()
-        yield  # workers of other seeds start meanwhile
+        yield None  # workers of other seeds start meanwhile
         stage.restart_collection()
         while not stage.finished:
             before = stage.frames
             stage.request()
-            yield  # other seeds request their batches before this one waits
+            yield None  # other seeds request their batches before this one waits
             report.batch(stage.collect(), (yield from stage.learn()))
             while stage.has_due_updates and not stop.requested:
                 yield from stage.learn()
@@ -197,7 +197,8 @@ class _Report:
         self.clock = now
 
     def write(self) -> None:
-        values = {"updates": self.stage.progress.updates, "episodes": self.stage.progress.episodes}
+        progress = self.stage.progress
+        values: dict[str, float] = {"updates": progress.updates, "episodes": progress.episodes}
         if self.returns:
             values["return"] = sum(self.returns) / len(self.returns)
         if self.solved:

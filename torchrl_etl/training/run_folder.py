@@ -41,7 +41,9 @@ class RunFolder:
 
     def __init__(self, path: Path, config: DictConfig, *, unique: bool = False) -> None:
         self.path, self._unique = Path(path).expanduser().resolve(), unique
-        self._config, self._loggers, self._purge_step = config, None, None
+        self._config = config
+        self._loggers: list[Any] | None = None
+        self._purge_step: int | None = None
 
     def open(self, *, resume: bool) -> None:
         """Create the folder and write the configuration and the versions to it.

@@ -130,8 +130,8 @@ class Run:
         folder = self.folder
         if folder is None or not (starts := folder.versions):
             return
-        own = {"task": self.task, "goal": self.goal, "method": self.method, "seed": self.seed}
-        own |= {"status": status}
+        own: dict[str, Any] = {"task": self.task, "goal": self.goal, "method": self.method}
+        own |= {"seed": self.seed, "status": status}
         before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
         own["episodes"] = self.episodes
         series = {
@@ -279,7 +279,7 @@ class Sweep:
 
     def stop(self) -> None:
         """Ask running processes to save and exit, wait for them, and write the table."""
-        active = {run.process for run in self.runs if self.status(run) == "running"}
+        active = {run.process for run in self.runs if run.process and self.status(run) == "running"}
         for process in active:
             process.send_signal(signal.SIGTERM)
         for process in active:

@@ -115,7 +115,8 @@ class EpisodeRecorder:
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
         # has_free_root resets the environment, before the renderer copies its terrain.
-        self._follows, self._framed = has_free_root(env), None
+        self._follows = has_free_root(env)
+        self._framed: Any = None
         try:
             self._renderer = mujoco.Renderer(model, *size)
         except Exception as error:  # the GL back ends share no base class
@@ -183,7 +184,9 @@ class EpisodeRecorder:
         far, box = 3 * self._framed.distance, int(mujoco.mjtGeom.mjGEOM_BOX)
         wall = scene.geoms[scene.ngeom]
         place, size = self._framed.lookat + far * forward, np.array([4 * far, 4 * far, 1e-3])
-        mujoco.mjv_initGeom(wall, box, size, place, frame.reshape(-1), np.float32(_BACKDROP))
+        mujoco.mjv_initGeom(
+            wall, box, size, place, frame.reshape(-1), np.array(_BACKDROP, np.float32)
+        )
         wall.emission, wall.specular, wall.reflectance = 1.0, 0.0, 0.0
         scene.ngeom += 1
 
