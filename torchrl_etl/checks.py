@@ -11,6 +11,7 @@ import math
 import numbers
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TypeGuard
 
 from torch import Tensor
 
@@ -74,8 +75,7 @@ def check_real(interval: str, **values: object) -> None:
     low, high = map(float, interval[1:-1].split(","))
     for name, value in values.items():
         within = (
-            isinstance(value, numbers.Real)  # NumPy's scalars, too
-            and not isinstance(value, bool)
+            _is_real(value)
             and math.isfinite(value)
             and (low <= value if interval[0] == "[" else low < value)
             and (value <= high if interval[-1] == "]" else value < high)
@@ -185,8 +185,12 @@ def check_flag(**values: object) -> None:
             raise ValueError(f"{name} is {value!r}; it must be true or false.")
 
 
-def _is_integer(value: object) -> bool:
+def _is_integer(value: object) -> TypeGuard[int]:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _is_real(value: object) -> TypeGuard[float]:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)  # NumPy's scalars, too
 
 
 def not_finite(state: Mapping[str, Tensor]) -> str | None:

@@ -180,8 +180,8 @@ def print_intervals(summary: Mapping[str, Any]) -> None:
     """Print the return and success of an :meth:`~torchrl_etl.training.Evaluation.summary`."""
     for key in ("return", "solved", "solved_time"):
         if key in summary:
-            mean, *ends = summary[key].values()
-            interval = interval_in_words(*ends, digits=3)
+            mean, low, high = summary[key].values()
+            interval = interval_in_words(low, high, digits=3)
             print(f"  {key:<12} {mean:.3f}" + (f"  ({interval})" if interval else ""))
 
 
@@ -225,7 +225,7 @@ def _print(*parts: str) -> None:
 def _of_groups(conf: Path, groups: list[str], choices: Mapping[str, str]) -> Iterator[str]:
     """The settings of the chosen group files, as sections of the configuration."""
     for group in groups:
-        if (file := group_files(conf, group).get(choices.get(group))) is not None:
+        if (file := group_files(conf, group).get(choices.get(group, ""))) is not None:
             inner = textwrap.indent(file.read_text(encoding="utf-8").rstrip(), "  ")
             yield f"{group}:   # {group}={choices[group]}\n{inner}"
 

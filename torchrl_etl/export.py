@@ -37,8 +37,10 @@ _GROUPS = {
 """Groups of the configuration, and the setting that identifies the chosen file."""
 
 # Settings left out of the command: location, display, resources, and the path of a bundle.
-_OF_THE_PLACE = ("run_dir", "resume", "log", "logger_kwargs", "log_every", "progress", "pictures")
-_OF_THE_PLACE += ("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed")
+_OF_THE_PLACE = (
+    *("run_dir", "resume", "log", "logger_kwargs", "log_every", "progress", "pictures"),
+    *("seeds", "threads", "vaf_curve", "synergies.bundle", "ray", "distributed"),
+)
 
 
 def export_run(

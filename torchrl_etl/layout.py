@@ -84,7 +84,7 @@ def choose_layout(
     finally:
         stage.close()
         torch.set_num_threads(before)
-    best = max(speeds, key=speeds.get)
+    best = max(speeds, key=speeds.__getitem__)
     if speeds[best] < CLEARLY_FASTER * speeds[candidates[0]]:
         best = candidates[0]
     found = "; ".join(f"{each}: {speed:.0f}" for each, speed in speeds.items())

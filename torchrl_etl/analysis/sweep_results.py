@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -244,6 +244,7 @@ def _versions(where: str, name: str, text: str) -> Mapping[str, str]:
     return {str(name): str(version) for name, version in versions.items()}
 
 
-_PARSERS = {"seed": _integer, "frames": _integer, "solved": _share, "solved_time": _share}
-_PARSERS |= {"return": _number, "episodes": _number, "wall_seconds": _number}
-_PARSERS |= {"versions": _versions}
+_PARSERS: dict[str, Callable[[str, str, str], Any]] = {
+    **{"seed": _integer, "frames": _integer, "solved": _share, "solved_time": _share},
+    **{"return": _number, "episodes": _number, "wall_seconds": _number, "versions": _versions},
+}

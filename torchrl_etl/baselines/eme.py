@@ -117,7 +117,7 @@ class EMELoss(LossModule):
 
     _AcceptedKeys = BehavioralMetricLoss._AcceptedKeys  # both metrics read the same keys
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
+    tensor_keys: BehavioralMetricLoss._AcceptedKeys
 
     encoder: TensorDictModuleBase
     encoder_params: TensorDictParams

@@ -250,7 +250,7 @@ def _cluster(address: str | None, cpus: int) -> dict[str, Any]:
         raise ImportError("RayWorkers needs Ray: pip install 'torchrl_etl[ray]'.")
     config = {"address": address or "local", "log_to_driver": False, "logging_level": "error"}
     if address is None:  # the caller decides how many workers fit this machine
-        config |= {"num_cpus": max(cpus + 1, os.cpu_count()), "include_dashboard": False}
+        config |= {"num_cpus": max(cpus + 1, os.cpu_count() or 1), "include_dashboard": False}
     return config
 
 

@@ -71,6 +71,7 @@ class RemoteWorkers:
     """
 
     policy: TensorDictModuleBase
+    num_workers: int
     timeout: float
 
     def _prepare(self, policy: nn.Module, sync: bool, total_frames: int, timeout: float) -> None:
@@ -78,7 +79,8 @@ class RemoteWorkers:
         # TorchRL 0.14.1 treats -1 ("no limit") as a limit that has been reached.
         self.total_frames = sys.maxsize if total_frames < 0 else total_frames
         self.collected_frames, self._stopped = 0, False
-        self.policy_version, self._known = 0, {}
+        self.policy_version = 0
+        self._known: dict[int, int] = {}
         self._weights = weights_of(policy)
 
     @abstractmethod

@@ -148,9 +148,9 @@ def check_compatible(
     actuators = tuple(actuators)
     if actuators != info.actuators:
         raise BundleError(_explain_names(info, actuators))
-    for side, ours, theirs in (("lower", info.low, low), ("upper", info.high, high)):
-        ours = torch.tensor(ours, dtype=torch.float64)
-        theirs = torch.as_tensor(theirs).detach().cpu().double().expand(len(ours))
+    for side, own, other in (("lower", info.low, low), ("upper", info.high, high)):
+        ours = torch.tensor(own, dtype=torch.float64)
+        theirs = torch.as_tensor(other).detach().cpu().double().expand(len(ours))
         differ = ~torch.isclose(ours, theirs, rtol=1e-5, atol=1e-6)
         if differ.any():
             first = int(differ.nonzero()[0])

@@ -136,7 +136,7 @@ def _read_csv(path: Path) -> tuple[Columns, Lines]:
                 f"Line {number} of {path} has {len(row)} entries but the first line {len(names)}; "
                 "complete it or leave it out."
             )
-    columns = [(name, [row[i].strip() for _, row in rows]) for i, name in enumerate(names)]
+    columns: Columns = [(name, [row[i].strip() for _, row in rows]) for i, name in enumerate(names)]
     return columns, [number for number, _ in rows]
 
 
@@ -163,7 +163,7 @@ def _read_numpy(path: Path, trial: str) -> Columns:
         return _columns(path, archive)
     matrices = [name for name, array in archive.items() if array.ndim == 2]
     if not matrices:
-        columns = [pair for pair in archive.items() if pair[1].ndim == 1]
+        columns: Columns = [pair for pair in archive.items() if pair[1].ndim == 1]
         if len(lengths := {len(column) for _, column in columns}) > 1:
             raise ValueError(
                 f"The arrays of {path} have {' and '.join(map(str, sorted(lengths)))} rows; they "

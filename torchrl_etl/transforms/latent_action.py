@@ -24,6 +24,8 @@ from torchrl_etl.transforms.keys import (
 )
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from torchrl.envs import EnvBase
     from torchrl.envs.transforms import Transform
 
@@ -316,7 +318,7 @@ def _without(spec: Composite, key: NestedKey) -> Composite:
 def _refuse_replay_buffer(name: str) -> None:
     # A buffer puts its transforms in a Compose without an env, just as an env pipeline is before it
     # is attached. Only the caller tells the two apart.
-    frame = sys._getframe(1)
+    frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         # ``issubclass``, because TorchRL's ``isinstance`` hook queries attributes of its argument,
         # which fails on half-built envs among the callers.

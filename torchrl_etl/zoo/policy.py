@@ -103,8 +103,8 @@ def describe_decoder(decoder: SynergyMap | None) -> dict[str, Any] | None:
 
 
 def _spec(low: list[float], high: list[float]) -> Bounded:
-    low, high = torch.tensor(low), torch.tensor(high)
-    return Bounded(low, high, shape=low.shape, dtype=torch.float32)
+    bounds = torch.tensor(low), torch.tensor(high)
+    return Bounded(*bounds, shape=bounds[0].shape, dtype=torch.float32)
 
 
 def _make_decoder(described: Mapping[str, Any], low: list[float], high: list[float]) -> SynergyMap:

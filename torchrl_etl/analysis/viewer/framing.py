@@ -54,8 +54,8 @@ def middle_and_size(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndar
     from torchrl_etl.analysis.viewer.muscles import paths  # imported here, since it needs MuJoCo
 
     bodies, path = moving_bodies(model), paths(model, data)
-    places = [data.xpos[bodies], _corners(model, data, bodies), path.start, path.end]
-    places = np.concatenate(places)
+    corners = _corners(model, data, bodies)
+    places = np.concatenate([data.xpos[bodies], corners, path.start, path.end])
     low, high = places.min(0), places.max(0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.1)
 
