@@ -123,7 +123,7 @@ def test_fit_refuses_one_row_and_warns_of_identical_rows(use):
 
 @pytest.mark.parametrize("use", USES[:2])
 def test_actions_in_far_smaller_units_than_the_bounds_are_warned_of(use):
-    with pytest.warns(UserWarning, match="give the model low= and high= in the units"):
+    with pytest.warns(UserWarning, match="pass the model low= and high= in the units"):
         use(gmvae(), 1e-3 * np.abs(ACTIONS) - 1)
 
 

@@ -198,7 +198,7 @@ def test_second_sweep_in_the_same_folder_is_refused(tmp_path):
     other = f"from torchrl_etl.training import Sweep; Sweep([], {str(tmp_path / 'out')!r}, jobs=1)"
     environ = os.environ | {"PYTHONPATH": str(ROOT)}
     ended = subprocess.run([sys.executable, "-c", other], capture_output=True, env=environ)
-    assert b"Another queue works in" in ended.stderr
+    assert b"Another queue uses" in ended.stderr
     sweep.stop()
 
 
