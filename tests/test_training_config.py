@@ -282,6 +282,12 @@ def test_renamed_setting_is_refused_with_its_new_name(argument, words):
         translate([argument], CONF)
 
 
+def test_misspelled_kind_of_synergies_is_refused_with_the_nearest():
+    with pytest.raises(ValueError, match=r"synergies is 'nmff'; choose .*\(nearest: nmf\)"):
+        translate(["synergies=nmff"], CONF)
+    assert translate(["synergies=body"], CONF) == ["synergies.bundle=body"]
+
+
 @pytest.mark.parametrize("now", sorted(set(RENAMED.values())))
 def test_every_new_name_of_a_renamed_setting_exists(now):
     key = now.partition("=")[0]

@@ -19,6 +19,7 @@ import gymnasium
 from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
+from torchrl_etl.methods.etl import BODY
 from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED, quoted
 from torchrl_etl.training.resumed import check_prefix, parse_override
 from torchrl_etl.user_conf import group_files
@@ -106,7 +107,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
     the folder of the configuration's groups.
 
     Raises:
-        ValueError: for a renamed setting, with its new name.
+        ValueError: for a renamed setting, with its new name, or unknown synergies.
 
     Examples:
         >>> groups = Path("recipes/conf")
@@ -127,6 +128,8 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         if name in ("synergies.kind", "exploration.kind", "method.kind") and ":" not in value:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:
+            if value.isidentifier() and value != "null" and not Path(value).exists():
+                check_choice("synergies", value, [*kinds, BODY, "zoo:NAME", "an existing folder"])
             key = "synergies.bundle"
         elif value in PRESETS.get(name, ()):
             continue
