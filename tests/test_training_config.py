@@ -117,7 +117,7 @@ def test_every_task_of_the_paper_is_valid(task):
         ("log=tensorboard", "log is 'tensorboard'; it must be a list"),
         ("log=[wandb]", "pip install wandb"),
         ("stage=learn", "stage=learn needs synergies=PATH"),
-        ("stage=explore synergies=x", "leave it out or use stage=learn"),
+        ("stage=explore synergies=some/x", "leave it out or use stage=learn"),
         ("synergies=nowhere", "nowhere"),
         ("device=gpu", "device is 'gpu'; use cpu, cuda or cuda:0"),
         ("log=[csv,tensorbord]", "nearest: tensorboard"),
