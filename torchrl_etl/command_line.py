@@ -118,13 +118,12 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         ...
         ValueError: learn.anchor is called learn.decoder.distillation_weight now.
     """
-    translated = []
+    kinds, translated = group_files(groups, "synergies"), []
     for argument in arguments:
         key, equals, value = argument.partition("=")
         name = key.lstrip("+~")
         if (old := _former(name)) is not None:
             raise ValueError(f"{name} is called {RENAMED[old]}{name.removeprefix(old)} now.")
-        kinds = group_files(groups, "synergies")
         if name in ("synergies.kind", "exploration.kind", "method.kind") and ":" not in value:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:

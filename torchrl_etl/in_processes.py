@@ -20,6 +20,7 @@ from torchrl_etl.command_line import quiet_torchrl
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.layout import available_cores
 from torchrl_etl.training import Interrupted, run_alone
+from torchrl_etl.training.config import resume_setting
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.sweep import end_with_parent
 
@@ -102,7 +103,7 @@ def _end(receiver: Connection, run: Mapping[str, Any], process: Any) -> Ended:
     except EOFError:  # the process was killed
         process.join()
         folder = Path(run["resume"] or run["config"].run_dir)
-        setting = shlex.quote(f"resume={folder}")
+        setting = shlex.quote(resume_setting([folder]))
         return folder, ChildProcessError(
             f"The process of {folder} ended with exit code {process.exitcode}; continue with "
             f"{setting}."

@@ -245,6 +245,12 @@ def _versions(where: str, name: str, text: str) -> Mapping[str, str]:
 
 
 _PARSERS: dict[str, Callable[[str, str, str], Any]] = {
-    **{"seed": _integer, "frames": _integer, "solved": _share, "solved_time": _share},
-    **{"return": _number, "episodes": _number, "wall_seconds": _number, "versions": _versions},
+    "seed": _integer,
+    "frames": _integer,
+    "solved": _share,
+    "solved_time": _share,
+    "return": _number,
+    "episodes": _number,
+    "wall_seconds": _number,
+    "versions": _versions,
 }

@@ -19,6 +19,7 @@ from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
 from torchrl_etl.extras import extra
 from torchrl_etl.io import as_json, read_json, write_atomically
+from torchrl_etl.training.config import resume_setting
 from torchrl_etl.user_code import find_class
 
 if TYPE_CHECKING:
@@ -64,9 +65,8 @@ class RunFolder:
             # Checked under the lock: another run may have started and finished meanwhile.
             if (self.path / "config.yaml").exists() and not resume:
                 self._lock.release()
-                setting = shlex.quote(f"resume={self.path}")  # as a shell takes it
                 raise _HoldsARun(
-                    f"{self.path} already holds a run; continue it with {setting}, or choose "
+                    f"{self.path} already holds a run; continue it with {self._resume}, or choose "
                     "another run_dir."
                 )
             write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
@@ -158,11 +158,15 @@ class RunFolder:
                 for key, value in values.items():
                     logger.log_scalar(key, float(value), step=frame)
         except OSError as error:
-            setting = shlex.quote(f"resume={self.path}")
             raise OSError(
                 f"The log of {self.path} cannot be written ({error.strerror or error}); fix that, "
-                f"then continue with {setting}."
+                f"then continue with {self._resume}."
             ) from error
+
+    @property
+    def _resume(self) -> str:
+        """The setting that resumes this run, quoted for a shell."""
+        return shlex.quote(resume_setting([self.path]))
 
     def series(self, key: str) -> tuple[list[int], list[float]]:
         """Frames and values of ``key`` in the CSV log."""
