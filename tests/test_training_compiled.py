@@ -93,6 +93,25 @@ def test_compiled_random_draws_are_not_merged():
 
 
 @pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="a folder nobody can write to")
+def test_another_number_of_threads_is_compiled_for_once():
+    """Inductor's kernels run on as many threads as PyTorch had when they were generated."""
+    traced_on = []
+
+    @compiled
+    def double(x: torch.Tensor) -> torch.Tensor:
+        traced_on.append(torch.get_num_threads())
+        return 2 * x
+
+    before = torch.get_num_threads()
+    try:
+        for threads in (2, 1, 2, 1):
+            torch.set_num_threads(threads)
+            assert double(torch.ones(3)).tolist() == [2, 2, 2]
+    finally:
+        torch.set_num_threads(before)
+    assert traced_on == [2, 1]
+
+
 def test_unwritable_compile_cache_is_named_with_its_variable(monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/sys/kernel")
     x = torch.linspace(-1, 1, 4, requires_grad=True)

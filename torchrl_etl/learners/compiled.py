@@ -39,9 +39,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     third of the matrix products.
 
     Tracing runs the function (:func:`~torch.fx.experimental.proxy_tensor.make_fx`), so TensorDict's
-    Python overhead is paid once. Inputs of other shapes trigger a recompilation. Any other tensors
-    that the function reads must keep their identity, though their values may change, and no branch
-    may depend on values. Random numbers come from PyTorch's generator and match eager execution.
+    Python overhead is paid once. Inputs of other shapes trigger a recompilation, as does another
+    number of PyTorch's threads, for which kernels are generated. Any other tensors that the
+    function reads must keep their identity, though their values may change, and no branch may
+    depend on values. Random numbers come from PyTorch's generator and match eager execution.
 
     If compilation fails (no compiler, a read-only cache, an unsupported operation), a warning gives
     the reason and the function runs uncompiled from this call on. The function must therefore have
@@ -63,7 +64,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         if failed:
             return function(*args)
         leaves, spec = tree_flatten(args)
-        kind = spec, [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
+        layouts = [(leaf.shape, leaf.stride(), leaf.dtype, leaf.device) for leaf in leaves]
+        kind = torch.get_num_threads(), spec, layouts
         try:
             graph = next((graph for known, graph in graphs if known == kind), None)
             if graph is None:
