@@ -58,6 +58,7 @@ def main() -> None:
     print(json.dumps({**shared, "learner_threads": torch.get_num_threads()}))
     print("ready", flush=True)
     for line in sys.stdin:
+        train_on(stage)  # a batch collected while the others ran is not counted
         print(training_speed(stage, float(line)), flush=True)
     stage.close()
 

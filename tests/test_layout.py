@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from unittest.mock import Mock
 
 import pytest
+import torch
 
 import torchrl_etl.layout as layout
 from tests.configs import tiny
@@ -69,6 +71,16 @@ def test_choose_layout_takes_and_names_the_fastest(speeds, fastest, kind, ahead)
 def test_choose_layout_stays_in_one_process_if_the_gain_is_small(speeds):
     speeds |= {Layout(0, 2): 70.0, Layout(1, 1): 71.0, Layout(1, 2): 72.0}
     assert choose_layout(auto()).collector.kind == "single"
+
+
+def test_layout_is_ranked_by_the_speed_that_it_sustains(monkeypatch):
+    periods = iter([700.0, 400.0, 700.0, 400.0, 700.0])
+    monkeypatch.setattr(layout, "train_on", lambda stage: None)
+    monkeypatch.setattr(layout, "training_speed", lambda stage, seconds: next(periods))
+    clock = iter(range(10))
+    monkeypatch.setattr(layout.time, "perf_counter", lambda: next(clock))
+    single = Layout(0, torch.get_num_threads())
+    assert layout.frames_per_second(Mock(), single, seconds=5.0) == 400
 
 
 def test_choose_layout_keeps_threads_that_are_given(speeds):
