@@ -143,7 +143,8 @@ def frames_per_second(stage: Stage, layout: Layout, seconds: float) -> float:
     stage.collect_from(**layout.collector)
     stage.restart_collection()
     train_on(stage)  # compiles; the batch may have been collected ahead of time
-    speeds, end = [], time.perf_counter() + seconds
+    speeds: list[float] = []
+    end = time.perf_counter() + seconds
     while not speeds or time.perf_counter() < end:
         speeds.append(training_speed(stage, seconds / PERIODS))
     return float(np.quantile(speeds, 0.25))
