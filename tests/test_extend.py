@@ -19,13 +19,12 @@ from torchrl.record.loggers import Logger
 from tests.commands import command
 from tests.configs import CONF, ROOT, composed, tiny
 from tests.stages import changed, fill, goes_on_after_a_load, prepared, snapshot
-from torchrl_etl.baselines import SARDecoder
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.exploration import Exploration
 from torchrl_etl.export import command_of
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SARDecoder, SynergyDecoder
 from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
 from torchrl_etl.training import resumed_config
 
@@ -99,7 +98,7 @@ class NoBundle(Learned):
     """A synergy model whose decoder is no SynergyDecoder."""
 
     def decoder(self, actions, *, residual=0.0):
-        return SARDecoder(actions.mean(0), self.loss.basis.detach(), **self.bounds)
+        return SARDecoder.from_basis(actions.mean(0), self.loss.basis.detach(), **self.bounds)
 
 
 @pytest.fixture

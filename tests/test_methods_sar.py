@@ -86,7 +86,7 @@ def test_sar_saves_a_bundle_that_its_run_does_not_read(tmp_path, monkeypatch):
     cosine = torch.nn.functional.cosine_similarity(ours, published, dim=-1)
     assert (cosine.abs() > 0.9).all()
 
-    monkeypatch.setattr(SAR, "_save_bundle", lambda self, actions: None)
+    monkeypatch.setattr(SAR, "_save_bundle", lambda self, model, actions: None)
     _, without = prepared(tmp_path / "b")
     for name, value in without.learner.objective.state_dict().items():
         assert torch.equal(value, stage.learner.objective.state_dict()[name])

@@ -1,5 +1,6 @@
 """Baselines of ETL, as parts that other TorchRL code can use."""
 
+from torchrl_etl.baselines.best_episodes import best_episodes
 from torchrl_etl.baselines.dep import DEPController, DEPExploration
 from torchrl_etl.baselines.dynsyn import GroupedTanhNormal, make_dynsyn_actor, set_frames
 from torchrl_etl.baselines.eme import EMELoss
@@ -8,7 +9,6 @@ from torchrl_etl.baselines.lattice import LatticeNormal, make_lattice_actor
 from torchrl_etl.baselines.lattice_noise import LatticeNoise
 from torchrl_etl.baselines.muscle_groups import group_muscles, record_muscle_lengths
 from torchrl_etl.baselines.reward_ensemble import RewardEnsemble
-from torchrl_etl.baselines.sar import SARDecoder, best_episodes
 
 __all__ = [
     "DEPController",
@@ -19,7 +19,6 @@ __all__ = [
     "LatticeNoise",
     "LatticeNormal",
     "RewardEnsemble",
-    "SARDecoder",
     "best_episodes",
     "group_muscles",
     "make_dynsyn_actor",

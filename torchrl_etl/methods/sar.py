@@ -12,13 +12,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_etl.analysis import variance_accounted_for
-from torchrl_etl.baselines import SARDecoder, best_episodes
+from torchrl_etl.baselines import best_episodes
 from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.learners.parts import episode_numbers
 from torchrl_etl.methods.method import Method
+from torchrl_etl.modules import SARDecoder
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import SARSynergies
 from torchrl_etl.training.context import Context
@@ -43,7 +44,7 @@ class SAR(Method):
 
     Options: ``play_task`` (another task of the same body), ``frames`` of play, ``rollout_frames``
     after play, ``preview_episodes`` and the ``percentile`` of their returns, ``num_synergies``, and
-    ``blend`` of :class:`~torchrl_etl.baselines.SARDecoder`.
+    ``blend`` of :class:`~torchrl_etl.modules.SARDecoder`.
     """
 
     takes = (
@@ -91,8 +92,9 @@ class SAR(Method):
             play = self.play_stage()
             yield from self.context.run_stage(play, stop)
             actions = self.best((yield from rollouts(play, self.rollout_frames, stop.check)))
-            decoder = self.fit(actions)
-            self._save_bundle(actions)
+            model = self.fit(actions)
+            decoder = model.blended_decoder(actions, blend=self.blend)
+            self._save_bundle(model, actions)
             # Written last, since its presence marks this step as complete.
             write_atomically(self.file, save(decoder.state_dict()))
         return {}
@@ -121,23 +123,21 @@ class SAR(Method):
             preview=torch.cat(returns) if returns else None,
         )
 
-    def fit(self, actions: Tensor) -> SARDecoder:
+    def fit(self, actions: Tensor) -> SARSynergies:
         spec, seed = self.context.spec, self.context.config.seed
-        bounds = {"low": spec.low, "high": spec.high}
-        return SARDecoder.fit(actions, self.num_synergies, **bounds, blend=self.blend, seed=seed)
-
-    def _save_bundle(self, actions: Tensor) -> None:
-        context = self.context
-        spec, seed = context.spec, context.config.seed
         model = SARSynergies(spec.low, spec.high, self.num_synergies, seed=seed)
+        model.most_rows = len(actions)  # of the best episodes, all count
         model.fit(actions)
+        return model
+
+    def _save_bundle(self, model: SARSynergies, actions: Tensor) -> None:
         vaf = variance_accounted_for(actions, model.reconstruct(actions))
         model.save(
-            context.folder.synergies,
+            self.context.folder.synergies,
             actions,
             task=self.played,
-            actuators=spec.actuators,
-            facts={"vaf": vaf, "frames": self.charged_frames, "seed": seed, **facts()},
+            actuators=self.context.spec.actuators,
+            facts={"vaf": vaf, "frames": self.charged_frames, "seed": model.seed, **facts()},
         )
 
     def decoder(self) -> SARDecoder | None:
@@ -150,9 +150,9 @@ class SAR(Method):
     def _placeholder(self) -> SARDecoder:
         """A decoder of the right sizes, for use before play."""
         spec = self.context.spec
-        blank = torch.zeros(1 + self.num_synergies, spec.action_dim)
+        sizes, bounds = (self.num_synergies, spec.action_dim), {"low": spec.low, "high": spec.high}
         with naming("method.options"):
-            return SARDecoder(blank[0], blank[1:], low=spec.low, high=spec.high, blend=self.blend)
+            return SARDecoder(*sizes, **bounds, blend=self.blend)
 
     def stage(self) -> Stage:
         decoder = self.decoder()

@@ -18,8 +18,6 @@ from torchrl_etl.synergies.model import SynergyModel
 
 __all__ = ["AffineSynergies"]
 
-_MOST_ROWS = 20_000
-
 
 class AffineSynergies(SynergyModel):
     """A model that maps coefficients to actions through a basis [d, n], perhaps before the bounds.
@@ -40,6 +38,8 @@ class AffineSynergies(SynergyModel):
     basis: Tensor | None = None
     highest: ClassVar[float] = NEAREST
     """Largest action at the middle of the box, in units where the bounds are ±1."""
+    most_rows: int = 20_000
+    """Actions in :meth:`fit`; of more, a regular stride is taken."""
 
     def __init__(self, low: Tensor, high: Tensor, num_synergies: int) -> None:
         check_integer(1, num_synergies=num_synergies)
@@ -63,11 +63,10 @@ class AffineSynergies(SynergyModel):
         """Actions [*, n] of coefficients [*, d]."""
 
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
-        """See the base class; more than 20,000 actions are subsampled at a regular stride."""
         on_update()
         least = max(2, self.num_synergies)
         rows = as_actions(actions, low=self.low, high=self.high, min_rows=least)
-        rows = rows[:: 1 + (len(rows) - 1) // _MOST_ROWS]
+        rows = rows[:: 1 + (len(rows) - 1) // self.most_rows]
         basis = self.factorize(rows.detach().cpu().double().numpy())
         self.basis = torch.as_tensor(basis).to(self.low)
 

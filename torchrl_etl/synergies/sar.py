@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_etl.checks import check_integer
+from torchrl_etl.modules import SARDecoder
+from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.synergies.affine import AffineSynergies
 from torchrl_etl.synergies.factors import ignore_convergence_warnings, principal_components
 
 __all__ = ["SARSynergies", "independent_components"]
+
+_LEAST_VARIATION = 1e-5  # of the largest; a synergy below it moves nothing
 
 
 class SARSynergies(AffineSynergies):
@@ -20,9 +26,9 @@ class SARSynergies(AffineSynergies):
     :class:`~torchrl_etl.methods.SAR`.
 
     Deviates: SAR's map clamps actions to the bounds, where gradients vanish, spans all observed
-    coefficients, and blends in a raw action. Here the decoder is that of every affine kind: it
-    saturates smoothly near the bounds, spans the 1st to the 99th percentile of coefficients, and
-    adds a residual before the bounds, with an entropy correction.
+    coefficients, and blends in a raw action: :meth:`blended_decoder`. Here the decoder is that of
+    every affine kind: it saturates smoothly near the bounds, spans the 1st to the 99th percentile
+    of coefficients, and adds a residual before the bounds, with an entropy correction.
 
     Keyword Args:
         max_iter (int): maximum number of ICA iterations.
@@ -52,7 +58,8 @@ class SARSynergies(AffineSynergies):
         mean, basis = independent_components(
             actions, self.num_synergies, seed=self.seed, max_iter=self.max_iter
         )
-        self.mean = torch.as_tensor(mean).to(self.low)
+        self._components = torch.as_tensor(mean), torch.as_tensor(basis)  # in double precision
+        self.mean = self._components[0].to(self.low)
         self._inverse = torch.as_tensor(np.linalg.pinv(basis)).to(self.low)
         return basis
 
@@ -61,6 +68,42 @@ class SARSynergies(AffineSynergies):
 
     def compose(self, coefficients: Tensor) -> Tensor:
         return self.mean + coefficients @ self.basis
+
+    def blended_decoder(self, actions: Tensor, **options: Any) -> SARDecoder:
+        """SAR's own map, each of its coefficients scaled so that ``actions`` [N, n] span [-1, 1].
+
+        Deviates: the public code is fitted on activations in [0, 1] but outputs actions, which pass
+        MyoSuite's sigmoid once more. Here ``actions`` are activations mapped back through the
+        sigmoid to action units, a = 1/2 + ln(x / (1 - x)) / 5. The entry ``activation`` of
+        ``make_env(..., activations=True)`` already is in these units.
+
+        Keyword Args:
+            blend, in_keys, out_keys: see :class:`~torchrl_etl.modules.SARDecoder`.
+
+        Raises:
+            ValueError: if the actions vary in fewer than d dimensions.
+
+        Examples:
+            >>> actions = (torch.rand(100, 2) @ torch.rand(2, 6)).clamp(-1, 1)
+            >>> model = SARSynergies(-torch.ones(6), torch.ones(6), 2)
+            >>> model.fit(actions)
+            >>> model.blended_decoder(actions, blend=0.66).synergy_spec.shape
+            torch.Size([8])
+        """
+        self._check_fitted()
+        actions = as_actions(actions, low=self.low, high=self.high, min_rows=2)
+        mean, basis = self._components
+        least, most = ((actions.cpu().double() - mean) @ basis.pinverse()).aminmax(dim=0)
+        mean, basis = mean + (least + most) / 2 @ basis, ((most - least) / 2)[:, None] * basis
+        sizes = basis.norm(dim=-1)
+        if (varying := int((sizes > _LEAST_VARIATION * sizes.max()).sum())) < self.num_synergies:
+            raise ValueError(
+                f"{len(actions)} actions that vary in {varying} dimensions are too few for "
+                f"{self.num_synergies} synergies; collect more actions, or use fewer synergies."
+            )
+        return SARDecoder.from_basis(
+            mean.to(self.low), basis.to(self.low), low=self.low, high=self.high, **options
+        )
 
 
 def independent_components(

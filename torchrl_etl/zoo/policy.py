@@ -14,10 +14,10 @@ from tensordict.nn import (
 )
 from torchrl.data import Bounded
 
-from torchrl_etl.baselines import SARDecoder, make_dynsyn_actor, make_lattice_actor
+from torchrl_etl.baselines import make_dynsyn_actor, make_lattice_actor
 from torchrl_etl.checks import check_choice
 from torchrl_etl.learners import NORMALIZED, from_observation
-from torchrl_etl.modules import RunningNorm, SynergyDecoder, SynergyMap, make_actor
+from torchrl_etl.modules import RunningNorm, SARDecoder, SynergyDecoder, SynergyMap, make_actor
 
 __all__ = ["ACTORS", "describe_decoder", "make_policy"]
 
@@ -111,7 +111,5 @@ def _make_decoder(described: Mapping[str, Any], low: list[float], high: list[flo
     options = dict(described)
     check_choice("kind", kind := options.pop("kind", None), ("synergies", "sar"))
     number = options.pop("num_synergies")
-    if kind == "synergies":
-        return SynergyDecoder(number, len(low), low=low, high=high, **options)
-    blank = torch.zeros(1 + number, len(low))
-    return SARDecoder(blank[0], blank[1:], low=low, high=high, **options)
+    of_kind = SynergyDecoder if kind == "synergies" else SARDecoder
+    return of_kind(number, len(low), low=low, high=high, **options)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchrl_etl.baselines.sar import best_episodes
+from torchrl_etl.baselines import best_episodes
 
 
 def rows_of(returns: list[float], steps: list[int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,11 +14,11 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from tests.configs import tiny
-from torchrl_etl.baselines.sar import SARDecoder
 from torchrl_etl.envs import make_env
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.modules import SARDecoder, make_actor, make_critic
 from torchrl_etl.objectives import DecoderLoss, SynergySACLoss
+from torchrl_etl.synergies import SARSynergies
 from torchrl_etl.transforms import SynergyAction
 
 MUSCLES, SYNERGIES = 7, 3
@@ -43,10 +43,26 @@ def decode(decoder: SARDecoder, synergy: Tensor) -> Tensor:
     return decoder(entry)[decoder.out_keys[0]]
 
 
+def fitted(
+    actions: Tensor,
+    num: int,
+    *,
+    low: float = -1.0,
+    high: float = 1.0,
+    seed: int = 0,
+    **options: Any,
+) -> SARDecoder:
+    """The published map of these actions, in their dtype."""
+    bounds = (actions.new_full(actions.shape[-1:], bound) for bound in (low, high))
+    model = SARSynergies(*bounds, num, seed=seed)
+    model.fit(actions)
+    return model.blended_decoder(actions, **options)
+
+
 def by_hand(**kwargs: Any) -> SARDecoder:
     """Two synergies of three muscles."""
     basis = torch.tensor([[0.5, 0.0, -0.5], [0.0, 0.25, 0.25]])
-    return SARDecoder(torch.tensor([0.1, 0.2, 0.3]), basis, **kwargs)
+    return SARDecoder.from_basis(torch.tensor([0.1, 0.2, 0.3]), basis, **kwargs)
 
 
 # The basis ---------------------------------------------------------------------------------------
@@ -56,7 +72,7 @@ def by_hand(**kwargs: Any) -> SARDecoder:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_decoding_equals_scikit_learns_inverse_transforms(noise: float, seed: int) -> None:
     actions, *_ = planted(noise=noise)
-    decoder = SARDecoder.fit(actions, SYNERGIES, low=-9.0, high=9.0, blend=1.0, seed=seed)
+    decoder = fitted(actions, SYNERGIES, low=-9.0, high=9.0, blend=1.0, seed=seed)
     pca = PCA(SYNERGIES, random_state=seed)
     ica = FastICA(whiten="unit-variance", max_iter=1000, random_state=seed)
     scaler = MinMaxScaler((-1, 1))
@@ -73,7 +89,7 @@ def test_decoding_equals_scikit_learns_inverse_transforms(noise: float, seed: in
 def test_planted_synergies_are_found() -> None:
     """Each axis is one of the planted sources, up to order, sign and scale."""
     actions, mixing, middle = planted(rows=3000)
-    decoder = SARDecoder.fit(actions, SYNERGIES, blend=1.0)
+    decoder = fitted(actions, SYNERGIES, blend=1.0)
     found = torch.nn.functional.normalize(decoder.module.basis, dim=-1)
     cosines = (found @ torch.nn.functional.normalize(mixing, dim=-1).T).abs()
     assert (cosines.amax(1) > 0.98).all() and len(set(cosines.argmax(1).tolist())) == 3
@@ -85,7 +101,7 @@ def test_planted_synergies_are_found() -> None:
 
 def test_planted_actions_are_reconstructed_by_coefficients_in_the_box() -> None:
     actions, *_ = planted()
-    decoder = SARDecoder.fit(actions, SYNERGIES, blend=1.0)
+    decoder = fitted(actions, SYNERGIES, blend=1.0)
     basis, mean = decoder.module.basis, decoder.module.mean
     synergy = torch.linalg.lstsq(basis.T, (actions - mean).T).solution.T
     torch.testing.assert_close(decode(decoder, synergy), actions, atol=1e-6, rtol=0)
@@ -97,7 +113,7 @@ def test_planted_actions_are_reconstructed_by_coefficients_in_the_box() -> None:
 def test_fitting_is_deterministic_keeps_dtype_and_leaves_the_rng_alone() -> None:
     actions = planted(noise=0.05)[0].float()
     before = torch.get_rng_state()
-    one, other = (SARDecoder.fit(actions, SYNERGIES, seed=5) for _ in range(2))
+    one, other = (fitted(actions, SYNERGIES, seed=5) for _ in range(2))
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(one.module.basis, other.module.basis)
     assert one.module.basis.dtype == torch.float32 == one.low.dtype
@@ -133,7 +149,7 @@ def test_decoding_without_residual_by_hand() -> None:
 def test_actions_stay_in_the_bounds_and_reach_them(blend: float) -> None:
     basis = 5 * torch.randn(2, 3, generator=torch.Generator().manual_seed(0))
     low, high = torch.tensor([-1.0, 0.0, 2.0]), torch.tensor([1.0, 1.0, 3.0])
-    decoder = SARDecoder(torch.zeros(3), basis, low=low, high=high, blend=blend)
+    decoder = SARDecoder.from_basis(torch.zeros(3), basis, low=low, high=high, blend=blend)
     action = decode(decoder, decoder.synergy_spec.rand((500,)))
     assert ((action >= low) & (action <= high)).all()
     assert (action == low).any(0).all() and (action == high).any(0).all()
@@ -165,7 +181,7 @@ def test_gradients_flow_through_to_the_coefficients() -> None:
 
 def test_state_dict_round_trip() -> None:
     one = by_hand(low=[-1.0, -2.0, -3.0])
-    other = SARDecoder(torch.zeros(3), torch.zeros(2, 3))
+    other = SARDecoder(2, 3)
     other.load_state_dict(one.state_dict())
     synergy = one.synergy_spec.rand((9,))
     assert torch.equal(decode(other, synergy), decode(one, synergy))
@@ -174,7 +190,7 @@ def test_state_dict_round_trip() -> None:
 
 def test_decoder_shares_no_memory_with_inputs_or_copies() -> None:
     mean, basis = torch.zeros(3), torch.ones(2, 3)
-    decoder = SARDecoder(mean, basis)
+    decoder = SARDecoder.from_basis(mean, basis)
     copied = copy.deepcopy(decoder)
     for tensor in (mean, basis, decoder.module.mean):
         tensor.fill_(9)
@@ -205,7 +221,7 @@ def test_bad_arguments_are_refused() -> None:
         with pytest.raises(ValueError, match=rf"blend is {blend}"):
             by_hand(blend=blend)
     with pytest.raises(ValueError, match=r"mean has shape \[3\] and basis \[2, 4\]"):
-        SARDecoder(torch.zeros(3), torch.zeros(2, 4))
+        SARDecoder.from_basis(torch.zeros(3), torch.zeros(2, 4))
     with pytest.raises(ValueError, match="every lower bound must be finite and below"):
         by_hand(low=1.0, high=1.0)
     with pytest.raises(ValueError, match=r"shape \(2,\) but there are 3 actuators"):
@@ -215,15 +231,17 @@ def test_bad_arguments_are_refused() -> None:
 def test_actions_that_cannot_be_fitted_are_refused() -> None:
     actions, *_ = planted()
     with pytest.raises(ValueError, match="vary in 3 dimensions are too few for 4 synergies"):
-        SARDecoder.fit(actions, 4)
+        fitted(actions, 4)
+    with pytest.raises(ValueError, match="vary in 1 dimensions are too few for 2 synergies"):
+        fitted(actions[:2], 2)
     with pytest.raises(ValueError, match=r"have 2 row.*at least 3 different actions"):
-        SARDecoder.fit(actions[:2], 2)
+        fitted(actions[:2], 3)
     with pytest.raises(ValueError, match=r"the bounds are \[0, 1\]; scale the actions to these"):
-        SARDecoder.fit(actions, 3, low=0.0, high=1.0)
+        fitted(actions, 3, low=0.0, high=1.0)
     with pytest.raises(ValueError, match="NaN or infinity"):
-        SARDecoder.fit(torch.where(actions > 0.3, torch.nan, actions), 3)
+        fitted(torch.where(actions > 0.3, torch.nan, actions), 3)
     with pytest.raises(ValueError, match=r"num_synergies is 0"):
-        SARDecoder.fit(actions, 0)
+        fitted(actions, 0)
 
 
 # In transforms, losses and stage 2 ---------------------------------------------------------------
@@ -231,7 +249,7 @@ def test_actions_that_cannot_be_fitted_are_refused() -> None:
 
 def overactuated_decoder(blend: float) -> SARDecoder:
     activity = torch.rand(300, 2) @ torch.randn(2, 16)
-    return SARDecoder.fit((0.3 * activity).clamp(-1, 1), 2, blend=blend)
+    return fitted((0.3 * activity).clamp(-1, 1), 2, blend=blend)
 
 
 @pytest.mark.parametrize("blend", [1.0, 0.66])
@@ -304,7 +322,7 @@ def test_stage_2_trains_the_actor_and_keeps_the_sar_decoder(blend: float) -> Non
 
 @pytest.mark.parametrize("blend", [0.66, 1.0])
 def test_encode_inverts_decode_inside_the_bounds(blend: float) -> None:
-    decoder = SARDecoder(
+    decoder = SARDecoder.from_basis(
         torch.tensor([0.4, 0.5, 0.6]),
         torch.tensor([[0.2, 0.0, 0.1], [0.0, 0.1, -0.1]]),
         low=0.0,
