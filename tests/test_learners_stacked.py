@@ -218,7 +218,7 @@ def pays_by(network, **options):
 def test_transforms_of_stacked_learners_share_no_state():
     learners, inputs = paid_learners(lambda: pays_by(torch.nn.Linear(3, 1)))
     alone = [
-        learner.loss(own[0])[1]["loss_qvalue"]
+        learner.loss(own[0]["batch"], own[0]["draws"])[1]["loss_qvalue"]
         for learner, own in zip(learners, inputs, strict=True)
     ]
     together = StackedLearners(learners).updates(inputs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -121,9 +121,10 @@ def support(bins: int, bound: float | None) -> Tensor | None:
     return torch.linspace(-bound, bound, bins)
 
 
-def drawn_in(inputs: TensorDictBase) -> AbstractContextManager[None]:
-    """Context in which losses take their random numbers from ``inputs["draws"]``."""
-    draws = inputs["draws"]
+def drawn_in(draws: TensorDictBase | None) -> AbstractContextManager[None]:
+    """Context in which losses take their random numbers from entries "0", "1", ... of ``draws``."""
+    if draws is None:
+        return nullcontext()
     return given_draws(draws[f"{i}"] for i in range(len(draws.keys())))
 
 

@@ -170,20 +170,50 @@ class SACLearner:
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._stepped = list(actor.parameters())
-        self._draw = redrawn(self._loss)
-        self._step_along(self.gradients)
+        self._draw = redrawn(self.loss)
+        self._compile(self.gradients)
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Update on a batch of transitions [B]; returns scalars to log."""
+        """Update once on a batch of transitions [B]; returns scalars to log."""
         return self.updates(self.inputs(batch.unsqueeze(0)))[0]
 
     def updates(self, inputs: TensorDictBase) -> TensorDictBase:
         """Run k updates on :meth:`inputs` [k], in order; returns scalars to log [k]."""
         scalars = []
         for each in inputs.unbind(0):
-            scalars.append(self._step(each))
-            self.ema.update()  # reads its count in Python, so it is not part of a CUDA graph
+            scalars.append(self._step(each))  # `step`, on CUDA replayed as one graph
+            self.ema.update()  # reads its count in Python, so it is not part of the graph
         return torch.stack(scalars)
+
+    def step(self, inputs: TensorDictBase) -> TensorDictBase:
+        """Update networks, temperature, targets and statistics once; returns scalars to log."""
+        gradients, scalars, statistics = self._gradients(inputs)  # `gradients`, compiled
+        self.optimizer.step_along(gradients)
+        normalize_rows(self.unit_rows)
+        for target in self.targets:
+            target.step()
+        if statistics:
+            torch._foreach_copy_(list(self.statistics.values()), statistics)
+        return scalars
+
+    def gradients(self, inputs: TensorDictBase) -> Gradients:
+        """Gradients of the objective in the order of ``parameters``. Changes no state."""
+        loss, scalars, statistics = self.loss(inputs["batch"], inputs["draws"])
+        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        return gradients, scalars.detach(), statistics
+
+    def loss(
+        self, batch: TensorDictBase, draws: TensorDictBase | None = None
+    ) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
+        """The objective on a batch [B], scalars to log, and new statistics. Changes no state.
+
+        ``draws`` holds its random numbers, as in :meth:`inputs`; by default it draws them.
+        """
+        statistics = {name: self.objective.get_buffer(name).clone() for name in self.statistics}
+        with drawn_in(draws):
+            # Tying weights would leave the copies in a module that is registered under two names.
+            loss, scalars = functional_call(self.objective, statistics, (batch,), tie_weights=False)
+        return loss, scalars, tuple(statistics.values())
 
     def inputs(self, batches: TensorDictBase) -> TensorDictBase:
         """Inputs of k updates: these batches [k, B] under ``batch``, and under ``draws`` the random
@@ -191,38 +221,6 @@ class SACLearner:
         drawn = self._draw(len(batches), batches[0])
         draws = TensorDict({f"{i}": each for i, each in enumerate(drawn)}, [len(batches)])
         return TensorDict({"batch": batches, "draws": draws}, [len(batches)])
-
-    def step(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Update networks, temperature, targets and statistics once; returns scalars to log."""
-        gradients, scalars, statistics = self._gradients(inputs)
-        self.descend(gradients)
-        if statistics:
-            torch._foreach_copy_(list(self.statistics.values()), statistics)
-        return scalars
-
-    def descend(self, gradients: Sequence[Tensor | None]) -> None:
-        """Take an optimizer step along gradients in the order of ``parameters``; move targets."""
-        self.optimizer.step_along(gradients)
-        normalize_rows(self.unit_rows)
-        for target in self.targets:
-            target.step()
-
-    def gradients(self, inputs: TensorDictBase) -> Gradients:
-        """Gradients of the objective in the order of ``parameters``. Changes no state."""
-        loss, scalars, statistics = self.loss(inputs)
-        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
-        return gradients, scalars.detach(), statistics
-
-    def loss(self, inputs: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
-        """The objective on these inputs, scalars to log, and new statistics. Changes no state."""
-        with drawn_in(inputs):
-            return self._loss(inputs["batch"])
-
-    def _loss(self, batch: TensorDictBase) -> tuple[Tensor, TensorDictBase, tuple[Tensor, ...]]:
-        statistics = {name: self.objective.get_buffer(name).clone() for name in self.statistics}
-        # Tying weights would leave the copies in a module that is registered under two names.
-        loss, scalars = functional_call(self.objective, statistics, (batch,), tie_weights=False)
-        return loss, scalars, tuple(statistics.values())
 
     def only(self, *terms: Term) -> SACLearner:
         """A learner that minimizes these terms only and shares this learner's optimizer."""
@@ -232,8 +230,8 @@ class SACLearner:
         twin.targets = [term.target for term in terms if term.target is not None]
         twin.ema = WarmedUpEMA(nn.Module(), 0.0)
         twin._stepped = list(twin.objective.terms.parameters())
-        twin._draw = redrawn(twin._loss)
-        twin._step_along(twin.gradients)
+        twin._draw = redrawn(twin.loss)
+        twin._compile(twin.gradients)
         return twin
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -287,10 +285,10 @@ class SACLearner:
         twin.optimizer = self.optimizer.mapped(other)
         twin.targets = [target.mapped(other) for target in self.targets]
         twin.ema = self.ema.mapped(other)
-        twin._step_along(gradients)
+        twin._compile(gradients)
         return twin
 
-    def _step_along(self, gradients: Callable[[TensorDictBase], Gradients]) -> None:
+    def _compile(self, gradients: Callable[[TensorDictBase], Gradients]) -> None:
         self._gradients = compiled(gradients) if self.compile else gradients
         graphed = self.compile and self.device.type == "cuda"
         self._step = cuda_graph(self.step) if graphed else self.step

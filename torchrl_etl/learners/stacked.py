@@ -92,7 +92,7 @@ class StackedLearners:
 
         def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Any, ...]:
             with held.to_module(self._whole, preserve_module_state=False):
-                return first.loss(own)
+                return first.loss(own["batch"], own["draws"])
 
         losses, scalars, statistics = torch.vmap(loss)(self._held(), inputs)
         gradients = torch.autograd.grad(losses.sum(), self._all.parameters, allow_unused=True)
@@ -104,7 +104,7 @@ class StackedLearners:
         first = self.learners[0].objective
 
         def reward(objective: Objective, own: TensorDictBase) -> Tensor:
-            with drawn_in(own):
+            with drawn_in(own["draws"]):
                 return objective.prepare(own["batch"])["next", objective.reward]
 
         def of_the_first(held: TensorDictBase, own: TensorDictBase) -> Tensor:
