@@ -102,7 +102,6 @@ def test_every_task_of_the_paper_is_valid(task):
         ("synergies.kl_weight=-1", "synergies.kl_weight is -1; it must be a number 0 or more"),
         ("learn.n_steps=0", "learn.n_steps is 0; it must be a whole number, 1 or more"),
         ("learn.sac.ema_decay=1", "learn.sac.ema_decay is 1; it must be a number in [0, 1)"),
-        ("learn.sac.unit_rows=1", "unit_rows is 1; it must be true or false"),
         ("critic.body=resnet", "choose one of mlp, residual"),
         ("frames=10", "frames is 10, but the stages before learning take 600"),
         ("actor.hidden=[0]", "actor.hidden is [0]; it must be a list of whole numbers"),
@@ -280,6 +279,11 @@ def test_no_preset_chooses_bfloat16(preset):
 def test_renamed_setting_is_refused_with_its_new_name(argument, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         translate([argument], CONF)
+
+
+def test_removed_setting_is_refused():
+    with pytest.raises(ValueError, match=r"learn\.sac\.unit_rows was removed, .* leave it out\."):
+        translate(["learn.sac.unit_rows=true"], CONF)
 
 
 def test_misspelled_kind_of_synergies_is_refused_with_the_nearest():

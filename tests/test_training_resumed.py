@@ -63,6 +63,16 @@ def test_config_with_former_setting_names_is_refused(file):
         resumed_config(file.parent, defaults=tiny())
 
 
+def test_config_with_a_removed_setting_resumes_only_at_its_default(file):
+    changed(file, learn__sac__unit_rows=False)
+    assert resumed_config(file.parent, defaults=tiny()) == tiny(
+        f"run_dir='{file.parent}'", "frames=1000"
+    )
+    changed(file, learn__sac__unit_rows=True)
+    with pytest.raises(ValueError, match=r"has learn\.sac\.unit_rows=True, which was removed"):
+        resumed_config(file.parent, defaults=tiny())
+
+
 def test_config_with_the_former_method_key_resumes(file):
     changed(file, method__learner="sac")
     config = OmegaConf.load(file)

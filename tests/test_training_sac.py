@@ -7,11 +7,9 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from tests.configs import RESIDUAL
 from tests.stages import changed, explorer, fill, learn_stage, method_stage, snapshot
 from torchrl_etl.training import run_alone
 
@@ -141,22 +139,6 @@ def test_num_critics_sets_the_number_of_critics(number):
     weights = stage.learner.objective.sac.qvalue_network_params.flatten_keys().values()
     assert {len(weight) for weight in weights} == {number}
     assert stage.update()["loss_qvalue"].isfinite()
-    stage.close()
-
-
-def test_unit_rows_normalizes_linear_layers_only(tmp_path):
-    settings = ("learn.sac.unit_rows=true", *RESIDUAL, f"run_dir={tmp_path}")
-    stage = learn_stage(None, *settings, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
-    fill(stage)
-    stage.update()
-    linear = [m.weight for m in stage.learner.actor.modules() if isinstance(m, nn.Linear)]
-    critics = stage.learner.objective.sac.qvalue_network_params
-    stacked = [p for p in critics.parameters() if p.ndim == 3]
-    assert len(linear) == len(stacked) == 6  # in, two in each of two blocks, out
-    for weight in (*linear, *stacked):
-        torch.testing.assert_close(weight.norm(dim=-1), torch.ones(weight.shape[:-1]))
-    norms = [m.weight for m in stage.learner.actor.modules() if isinstance(m, nn.LayerNorm)]
-    assert all(abs(norm.norm() - 4.0) < 0.1 for norm in norms)  # √16: as they started
     stage.close()
 
 

@@ -175,10 +175,10 @@ def check_flag(**values: object) -> None:
     """Raise a ``ValueError`` naming the first value that is neither true nor false.
 
     Examples:
-        >>> check_flag(unit_rows="no")
+        >>> check_flag(pictures="no")
         Traceback (most recent call last):
         ...
-        ValueError: unit_rows is 'no'; it must be true or false.
+        ValueError: pictures is 'no'; it must be true or false.
     """
     for name, value in values.items():
         if not isinstance(value, bool):

@@ -20,7 +20,7 @@ from torchrl_etl.checks import check_choice
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
 from torchrl_etl.methods.etl import BODY
-from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, RENAMED, quoted
+from torchrl_etl.training.config import OPEN_SECTIONS, PRESETS, REMOVED, RENAMED, quoted
 from torchrl_etl.training.resumed import check_prefix, parse_override
 from torchrl_etl.user_conf import group_files
 
@@ -107,7 +107,7 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
     the folder of the configuration's groups.
 
     Raises:
-        ValueError: for a renamed setting, with its new name, or unknown synergies.
+        ValueError: for a renamed setting, with its new name, a removed one, or unknown synergies.
 
     Examples:
         >>> groups = Path("recipes/conf")
@@ -124,6 +124,8 @@ def translate(arguments: Sequence[str], groups: Path) -> list[str]:
         name = key.lstrip("+~")
         if (old := _former(name)) is not None:
             raise ValueError(f"{name} is called {RENAMED[old]}{name.removeprefix(old)} now.")
+        if name in REMOVED:
+            raise ValueError(f"{name} was removed, since it did not help; leave it out.")
         if name in ("synergies.kind", "exploration.kind", "method.kind") and ":" not in value:
             key = name.removesuffix(".kind")
         elif name == "synergies" and equals and value not in kinds:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -31,7 +31,6 @@ __all__ = [
     "entropy_target",
     "episode_numbers",
     "from_observation",
-    "linear_weights",
     "make_loss",
     "make_optimizer",
     "make_return_scale",
@@ -136,12 +135,6 @@ def episode_numbers(batch: TensorDictBase) -> Tensor:
     number = batch["collector", "traj_ids"]
     worker = batch.get(("collector", "worker"), None)
     return number if worker is None else number + (worker << 32)
-
-
-def linear_weights(sac: LeanSACLoss) -> Iterator[Tensor]:
-    """Weights of the linear layers of actor [out, in] and stacked critics [critics, out, in]."""
-    for params, ndim in ((sac.actor_network_params, 2), (sac.qvalue_network_params, 3)):
-        yield from (p for p in params.parameters() if p.ndim == ndim)
 
 
 def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:

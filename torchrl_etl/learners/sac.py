@@ -19,7 +19,7 @@ from torch.func import functional_call
 from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_flag, check_real
+from torchrl_etl.checks import check_real
 from torchrl_etl.draws import redrawn
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
@@ -28,14 +28,13 @@ from torchrl_etl.learners.parts import (
     drawn_in,
     episode_numbers,
     from_observation,
-    linear_weights,
     make_loss,
     make_optimizer,
     make_return_scale,
     parameter_groups,
 )
 from torchrl_etl.learners.term import Term
-from torchrl_etl.modules import RunningNorm, SynergyMap, normalize_rows
+from torchrl_etl.modules import RunningNorm, SynergyMap
 from torchrl_etl.objectives import FusedSoftUpdate
 
 __all__ = ["Gradients", "SACLearner"]
@@ -79,7 +78,6 @@ class SACLearner:
         loss_function (str): loss of scalar critics. Default: ``"l2"``.
         return_bound (float, optional): scale rewards so that returns stay within ± this bound.
         bins (int): above 1, critics are categorical with ``bins`` atoms in ±``return_bound``.
-        unit_rows (bool): keep the rows of all linear layers at unit norm. Default: ``False``.
         on_frames (sequence of callable): called with the frame count after each batch.
         on_restart (sequence of callable): called when new episodes begin, with the number of
             actions that each worker has taken, so that counters in ``behavior`` can resume.
@@ -126,7 +124,6 @@ class SACLearner:
         loss_function: str = "l2",
         return_bound: float | None = None,
         bins: int = 1,
-        unit_rows: bool = False,
         on_frames: Sequence[Callable[[int], None]] = (),
         on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
@@ -135,7 +132,6 @@ class SACLearner:
         check_real("[0, 1]", lr_end=lr_end)
         check_real("(0, 1]", tau=tau)
         check_real("[0, 1)", ema_decay=ema_decay)
-        check_flag(unit_rows=unit_rows)
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
         self.on_frames, self.on_restart = on_frames, on_restart
@@ -165,8 +161,6 @@ class SACLearner:
         acting = actor if behavior is None else behavior
         self.behavior = from_observation(acting, normalizer, decoder)
         self.policy = from_observation(self.ema.module, normalizer, decoder)
-        self.unit_rows = list(linear_weights(sac)) if unit_rows else []
-        normalize_rows(self.unit_rows)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         self._stepped = list(actor.parameters())
@@ -189,7 +183,6 @@ class SACLearner:
         """Update networks, temperature, targets and statistics once; returns scalars to log."""
         gradients, scalars, statistics = self._gradients(inputs)  # `gradients`, compiled
         self.optimizer.step_along(gradients)
-        normalize_rows(self.unit_rows)
         for target in self.targets:
             target.step()
         if statistics:
@@ -226,7 +219,7 @@ class SACLearner:
         """A learner that minimizes these terms only and shares this learner's optimizer."""
         twin = copy(self)
         twin.objective = self.objective.only(*terms)
-        twin.statistics, twin.unit_rows = {}, []
+        twin.statistics = {}
         twin.targets = [term.target for term in terms if term.target is not None]
         twin.ema = WarmedUpEMA(nn.Module(), 0.0)
         twin._stepped = list(twin.objective.terms.parameters())
@@ -280,7 +273,6 @@ class SACLearner:
         """A copy that updates ``other(tensor)`` for each tensor, along these gradients."""
         twin = copy(self)
         twin.parameters = list(map(other, self.parameters))
-        twin.unit_rows = list(map(other, self.unit_rows))
         twin.statistics = {name: other(each) for name, each in self.statistics.items()}
         twin.optimizer = self.optimizer.mapped(other)
         twin.targets = [target.mapped(other) for target in self.targets]

@@ -11,7 +11,6 @@ from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 from torchrl_etl.modules.synergy_map import SynergyMap
 from torchrl_etl.modules.uniform_warmup import UniformWarmup
-from torchrl_etl.modules.unit_rows import normalize_rows
 
 __all__ = [
     "GMVAE",
@@ -28,6 +27,5 @@ __all__ = [
     "UniformWarmup",
     "make_actor",
     "make_critic",
-    "normalize_rows",
     "policy_function",
 ]

@@ -31,6 +31,7 @@ __all__ = [
     "MAY_CHANGE",
     "OPEN_SECTIONS",
     "PRESETS",
+    "REMOVED",
     "RENAMED",
     "bfloat16_warning",
     "check_device",
@@ -70,6 +71,9 @@ RENAMED = {
     "learn.sac.hold": "learn.noise",
 }
 """Former names of settings, with their current names."""
+
+REMOVED = {"learn.sac.unit_rows": False}
+"""Former settings, each with its default: runs that had it go on without the setting."""
 
 OPEN_SECTIONS = ("env_kwargs", "logger_kwargs", "ray", "distributed")
 """Sections whose keys are passed on to another library."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl_etl.extras import extra
 from torchrl_etl.io import surviving_folder
-from torchrl_etl.training.config import MAY_CHANGE, OPEN_SECTIONS, PRESETS, RENAMED
+from torchrl_etl.training.config import MAY_CHANGE, OPEN_SECTIONS, PRESETS, REMOVED, RENAMED
 
 with extra("recipes"):
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -118,6 +118,14 @@ def _stored(path: Path) -> DictConfig:
             f"{path} is of a release in which settings had other names ({old[0]}, now "
             f"{RENAMED[old[0]]}); continue with that release, or start a new run."
         )
+    for key, default in REMOVED.items():
+        section, _, name = key.rpartition(".")
+        value = (OmegaConf.select(config, section) or {}).pop(name, default)
+        if value != default:
+            raise ValueError(
+                f"{path} has {key}={value}, which was removed; continue with the release that made "
+                "it, or start a new run."
+            )
     return config
 
 
