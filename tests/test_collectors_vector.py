@@ -3,92 +3,29 @@
 from __future__ import annotations
 
 import warnings
-from functools import partial
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import ListStorage, ReplayBuffer, Unbounded
+from torchrl.data import Bounded, ListStorage, ReplayBuffer
 from torchrl.envs import (
-    Compose,
     ExplorationType,
-    InitTracker,
     RewardSum,
     StepCounter,
     TransformedEnv,
     set_exploration_type,
 )
-from torchrl.envs.transforms import Transform
 
+from tests.both_collectors import PLAIN, assert_same, batches, parts, tracked
 from tests.frozen_by_a_graph import CHANGES, MAKERS
 from tests.point_env import ACTION_DIM, OBSERVATION_DIM, vectorized_point
 from torchrl_etl.baselines.dynsyn import make_dynsyn_actor
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import make_env
-from torchrl_etl.modules import HeldNoise, SynergyDecoder, make_actor
-from torchrl_etl.transforms import DirectionPrimer, SynergyAction
-
-PLAIN = {"trust_policy": True, "auto_register_policy_transforms": False}
-
-
-def parts(name: str, mode: str, num_envs: int = 3, **kwargs):
-    """A function that makes the environment of a stage, and a policy for it."""
-    make = partial(make_env, name, num_envs=num_envs, **kwargs)
-    env = make()
-    spec = env.full_action_spec_unbatched["action"]
-    observation = {"observation": env.observation_spec["observation"].shape[-1]}
-    env.close()
-    torch.manual_seed(0)
-    if mode == "explore":
-        actor = make_actor({**observation, "direction": 4}, spec, hidden=(32, 32))
-        return lambda: TransformedEnv(make(), RewardSum()).append_transform(
-            DirectionPrimer(4)
-        ), actor
-    num_synergies = min(2, spec.shape[0])
-    decoder = SynergyDecoder(
-        num_synergies, spec.shape[0], low=spec.space.low, high=spec.space.high, hidden=(16,)
-    )
-    with torch.no_grad():
-        decoder.module.scale.fill_(5.0)  # so that actions differ
-    actor = make_actor(observation, decoder.synergy_spec, out_key="synergy", hidden=(32, 32))
-    if mode == "policy":
-        return lambda: TransformedEnv(make(), RewardSum()), TensorDictSequential(actor, decoder)
-    return lambda: TransformedEnv(make(), RewardSum()).append_transform(
-        SynergyAction(decoder)
-    ), actor
-
-
-def tracked() -> TransformedEnv:
-    return TransformedEnv(
-        make_env("overactuated", num_envs=3, seed=0), Compose(RewardSum(), InitTracker())
-    )
-
-
-def batches(
-    collector_class, make, policy, count: int = 3, frames: int = 96, change=lambda _: None, **kwargs
-):
-    collector = collector_class(make, policy, frames_per_batch=frames, total_frames=-1, **kwargs)
-    collector.set_seed(7)
-    torch.manual_seed(7)
-    collector.reset()
-    iterator = iter(collector)
-    found = []
-    for _ in range(count):
-        found.append(next(iterator).clone())
-        change(policy)
-    collector.shutdown()
-    return found
-
-
-def assert_same(ours, theirs) -> None:
-    for mine, other in zip(ours, theirs, strict=True):
-        assert mine.batch_size == other.batch_size and mine.names == other.names
-        assert set(mine.keys(True, True)) == set(other.keys(True, True))
-        for key in other.keys(True, True):
-            assert mine[key].dtype == other[key].dtype, key
-            assert torch.equal(mine[key], other[key]), key
+from torchrl_etl.modules import HeldNoise
+from torchrl_etl.transforms import LatentAction
 
 
 @pytest.mark.parametrize("mode", ["explore", "policy", "transform"])
@@ -267,53 +204,6 @@ def test_init_random_frames_are_collected_first():
     assert second["action"].min() > 0.9
 
 
-def test_two_transforms_of_one_class_both_apply():
-    make, policy = parts("overactuated", "explore")
-
-    def twice() -> TransformedEnv:
-        return make().append_transform(DirectionPrimer(2, out_key="other"))
-
-    ours = batches(VectorCollector, twice, policy)
-    assert_same(ours, batches(Collector, twice, policy, **PLAIN))
-    assert all(batch["next", key].any() for batch in ours for key in ("direction", "other"))
-
-
-class Pays(Transform):
-    """Writes an effort and multiplies the reward by ten for the transforms after it."""
-
-    def __init__(self) -> None:
-        super().__init__(in_keys=[], out_keys=["effort"])
-
-    def _step(self, tensordict, next_tensordict):
-        effort = next_tensordict["observation"][..., :1]
-        return next_tensordict.update({"effort": effort, "reward": 10 * next_tensordict["reward"]})
-
-    def transform_reward_spec(self, spec):
-        spec["effort"] = Unbounded((3, 1))
-        return spec
-
-    def array_step(self, now, after):
-        after["effort"] = after["observation"][..., :1]
-        after["reward"] = 10 * after["reward"]
-
-    def array_reset(self, now, fresh, done):
-        """A reset writes no effort."""
-
-
-def test_reward_sum_respects_its_keys_and_the_order_of_transforms():
-    make, policy = parts("overactuated", "policy")
-
-    def paid(*transforms: Transform) -> TransformedEnv:
-        return TransformedEnv(make().base_env, Compose(*transforms))
-
-    for order in (
-        lambda: paid(Pays(), RewardSum(["effort", "reward"], ["efforts", "rewards"])),
-        lambda: paid(RewardSum(), Pays()),
-    ):
-        ours = batches(VectorCollector, order, policy)
-        assert_same(ours, batches(Collector, order, policy, **PLAIN))
-
-
 @pytest.mark.parametrize(
     "name, value",
     [
@@ -329,10 +219,17 @@ def test_unsupported_arguments_are_refused_by_name(name, value):
         VectorCollector(make, policy, frames_per_batch=12, **{name: value})
 
 
+def twice_decoded() -> TransformedEnv:
+    make, _ = parts("overactuated", "transform")
+    module = TensorDictModule(nn.Linear(2, 2), ["z"], ["synergy"])
+    outer = LatentAction(module, Bounded(-1, 1, shape=(2,)), executed_key="executed_synergy")
+    return make().append_transform(outer)
+
+
 def test_unsupported_environments_are_refused():
     make, policy = parts("overactuated", "policy")
-    with pytest.raises(ValueError, match="has 2 RewardSum and VectorCollector takes one"):
-        VectorCollector(lambda: make().append_transform(RewardSum()), policy, frames_per_batch=12)
+    with pytest.raises(ValueError, match="has SynergyAction and LatentAction, and VectorColl"):
+        VectorCollector(twice_decoded, policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="has a StepCounter; use"):
         VectorCollector(lambda: make().append_transform(StepCounter()), policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="num_envs=2 or more"):

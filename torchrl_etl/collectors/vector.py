@@ -6,6 +6,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -18,21 +19,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import (
     EnvBase,
     GymWrapper,
-    InitTracker,
-    RewardSum,
     TransformedEnv,
     set_exploration_type,
 )
 from torchrl.envs.transforms import Transform
 from torchrl.modules import RandomPolicy
 
+from torchrl_etl.collectors.array_transform import ArrayTransform, on_arrays
 from torchrl_etl.collectors.policy_on_arrays import Arrays, PolicyOnArrays
-from torchrl_etl.transforms import SynergyAction
 
 __all__ = ["VectorCollector"]
 
-_AROUND_THE_STEP = (InitTracker, SynergyAction)
-_KNOWN = (RewardSum, *_AROUND_THE_STEP)
 _NOT_TAKEN = ("replay_buffer", "max_frames_per_traj", "track_policy_version", "compact_obs")
 
 
@@ -40,11 +37,10 @@ class VectorCollector(Collector):
     """TorchRL's ``Collector``, several times cheaper per step on vectorized Gymnasium tasks.
 
     The environment is :func:`~torchrl_etl.envs.make_env` with ``num_envs`` above one. Allowed
-    transforms are ``RewardSum``, ``InitTracker``, :class:`~torchrl_etl.transforms.SynergyAction`
-    and those with two methods on arrays, such as
-    :class:`~torchrl_etl.transforms.DirectionPrimer`. ``array_step(now, after)`` writes entries
-    below ``"next"`` after a step. ``array_reset(now, fresh, done)`` writes the root entries that
-    the next step starts from where episodes ended.
+    transforms are ``RewardSum``, ``InitTracker`` and those with the methods on arrays of
+    :class:`~torchrl_etl.collectors.ArrayTransform`, such as
+    :class:`~torchrl_etl.transforms.DirectionPrimer` and
+    :class:`~torchrl_etl.transforms.LatentAction`.
 
     TorchRL's specs, clones and containers cost more per step than a hand's physics. This rollout
     does the same arithmetic on arrays and fills one tensordict at the end. Its transitions are
@@ -98,13 +94,8 @@ class VectorCollector(Collector):
             "use_buffers": True,
         }
         super().__init__(create_env_fn, policy, **kwargs)
-        self._simulators, transforms = _take_apart(self.env)
-        known = {type(part): part for part in transforms if type(part) in _KNOWN}
-        summed: RewardSum | None = known.get(RewardSum)
-        self._sums = [*zip(summed.in_keys, summed.out_keys, strict=True)] if summed else []
-        self._init_tracker: InitTracker | None = known.get(InitTracker)
-        self._synergy_action: SynergyAction | None = known.get(SynergyAction)
-        self._in_order = [part for part in transforms if type(part) not in _AROUND_THE_STEP]
+        self._simulators, self._transforms = _take_apart(self.env)
+        self._action_of = _action_of(self._transforms)
         self._policy_on_arrays = PolicyOnArrays(self._wrapped_policy)
         foreign = sorted(kind.__name__ for kind in self._policy_on_arrays.foreign)
         if foreign and not isinstance(self._wrapped_policy, RandomPolicy):
@@ -118,8 +109,7 @@ class VectorCollector(Collector):
     @staticmethod
     def takes(transform: Transform) -> bool:
         """Whether the collector supports this transform."""
-        offers = hasattr(transform, "array_step") and hasattr(transform, "array_reset")
-        return offers or type(transform) in _KNOWN
+        return on_arrays(transform) is not None
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the simulators and the collector's own random numbers."""
@@ -158,8 +148,8 @@ class VectorCollector(Collector):
         now: Arrays = {key: value.numpy(force=True) for key, value in carrier.items(True, True)}
         rows: dict[NestedKey, list[np.ndarray]] = defaultdict(list)
         for _ in range(self.frames_per_batch):
-            written, after = self._step(now)
-            now |= written  # stays there, for stateful policies
+            now |= self._policy_on_arrays(now, self.policy_device)  # stays, for stateful policies
+            after = self._step(now)
             for key in now.keys() & recorded:
                 rows[key].append(now[key])
             for key, value in after.items():
@@ -174,49 +164,25 @@ class VectorCollector(Collector):
             carrier.set(key, torch.tensor(value))  # a copy: a policy may reuse its output buffers
         return batch
 
-    def _step(self, now: Arrays) -> tuple[Arrays, Arrays]:
-        """The policy's root entries, and the entries of the step below ``"next"``."""
-        written = self._policy_on_arrays(now, self.policy_device)
-        after: Arrays = {}
-        if self._synergy_action is None:
-            action = written["action"]
-        else:
-            synergy = torch.from_numpy(written[self._synergy_action.synergy_key])
-            action = self._synergy_action.decode(synergy).numpy()
-            after[self._synergy_action.executed_key] = action
-            written[self._synergy_action.decoded_key] = action
+    def _step(self, now: Arrays) -> Arrays:
+        """The entries of the step below ``"next"``."""
+        action = self._action_of(now)
         observations, reward, terminated, truncated, _ = self._simulators.step(action)
-        after |= _named(observations)
+        after = _named(observations)
         after["reward"] = reward.astype(np.float32)[:, None]
         after["terminated"], after["truncated"] = terminated[:, None], truncated[:, None]
         after["done"] = after["terminated"] | after["truncated"]
-        if self._init_tracker is not None:
-            after[self._init_tracker.out_keys[0]] = np.zeros_like(after["done"])
-        for transform in self._in_order:
-            if isinstance(transform, RewardSum):
-                for reward, total in self._sums:
-                    after[total] = now[total] + after[reward]
-            else:
-                transform.array_step(now, after)
-        return written, after
+        for transform in self._transforms:
+            transform.array_step(now, after)
+        return after
 
     def _restart(self, now: Arrays, done: np.ndarray) -> Arrays:
         """Root entries of the next step, with those of ended episodes reset."""
         fresh = _named(self._simulators.reset(options={"reset_mask": done})[0])
         for key in self.env.done_keys:
             fresh[key] = np.zeros_like(now[key])
-        if self._init_tracker is not None:
-            fresh[self._init_tracker.out_keys[0]] = done[:, None]
-        for transform in self._in_order:
-            if isinstance(transform, RewardSum):
-                for _, key in self._sums:
-                    fresh[key] = np.where(done[:, None], np.float32(0), now[key])
-            else:
-                transform.array_reset(now, fresh, done)
-        if self._synergy_action is not None:
-            key = self._synergy_action.executed_key
-            rest = self._synergy_action.rest(self.env.batch_size).numpy()
-            fresh[key] = np.where(done[:, None], rest, now[key])
+        for transform in self._transforms:
+            transform.array_reset(now, fresh, done)
         key = ("collector", "traj_ids")
         fresh[key] = now[key].copy()
         fresh[key][done] = self._traj_pool.get_traj_and_increment(int(done.sum())).numpy()
@@ -227,25 +193,31 @@ def _named(observations: Arrays | np.ndarray) -> Arrays:
     return observations if isinstance(observations, dict) else {"observation": observations}
 
 
-def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[Transform]]:
+def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[ArrayTransform]]:
     """The simulators of an environment, and its transforms from the inside out."""
     transforms: list[Transform] = []
     while isinstance(env, TransformedEnv):
         transforms = [*getattr(env.transform, "transforms", [env.transform]), *transforms]
         env = env.base_env
-    kinds = [type(transform) for transform in transforms]
-    if twice := next((kind for kind in _KNOWN if kinds.count(kind) > 1), None):
-        raise ValueError(
-            f"The environment has {kinds.count(twice)} {twice.__name__} and VectorCollector takes "
-            "one; use torchrl.collectors.Collector for it."
-        )
-    foreign = [transform for transform in transforms if not VectorCollector.takes(transform)]
+    found = [on_arrays(transform) for transform in transforms]
+    foreign = [part for part, its in zip(transforms, found, strict=True) if its is None]
     if foreign or not isinstance(env, GymWrapper) or not isinstance(env._env, SyncVectorEnv):
         what = type(foreign[0]).__name__ if foreign else f"{type(env).__name__} of one simulator"
         raise ValueError(
-            "VectorCollector supports make_env(..., num_envs=2 or more) with "
-            f"{', '.join(kind.__name__ for kind in _KNOWN)} and transforms that have array_step "
-            f"and array_reset, but the environment has a {what}; use "
-            "torchrl.collectors.Collector for it."
+            "VectorCollector supports make_env(..., num_envs=2 or more) with RewardSum, "
+            "InitTracker and transforms that have array_step and array_reset, but the environment "
+            f"has a {what}; use torchrl.collectors.Collector for it."
         )
-    return env._env, transforms
+    return env._env, found
+
+
+def _action_of(transforms: list[ArrayTransform]) -> Callable[[Arrays], np.ndarray]:
+    """Gives the simulators' action: the policy's, or that of a transform with ``array_action``."""
+    decoders = [transform for transform in transforms if hasattr(transform, "array_action")]
+    if len(decoders) > 1:
+        names = " and ".join(type(transform).__name__ for transform in decoders)
+        raise ValueError(
+            f"The environment has {names}, and VectorCollector takes one transform of the action; "
+            "use torchrl.collectors.Collector for it."
+        )
+    return decoders[0].array_action if decoders else itemgetter("action")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -199,6 +200,23 @@ class LatentAction(ModuleTransform):
     ) -> TensorDictBase:
         rest = self.rest(tensordict_reset.batch_size)
         return set_where_reset(self.parent, tensordict, tensordict_reset, self.executed_key, rest)
+
+    # VectorCollector calls these three, see its ArrayTransform.
+
+    def array_action(self, now: dict[NestedKey, Any]) -> np.ndarray:
+        latent = torch.from_numpy(now[self.latent_key])
+        now[self.decoded_key] = self.decode(latent).numpy()
+        return now[self.decoded_key]
+
+    def array_step(self, now: dict[NestedKey, Any], after: dict[NestedKey, Any]) -> None:
+        after[self.executed_key] = now[self.decoded_key]
+
+    def array_reset(
+        self, now: dict[NestedKey, Any], fresh: dict[NestedKey, Any], done: np.ndarray
+    ) -> None:
+        executed = now[self.executed_key].copy()
+        executed[done] = self.rest(torch.Size(done.shape))[done].numpy()
+        fresh[self.executed_key] = executed
 
     def rest(self, batch_size: torch.Size) -> Tensor:
         """Executed action before the first step, by convention: zeros clamped to the bounds."""
