@@ -53,7 +53,7 @@ def inputs(learners, batches):
 def with_stacked_weights(learners):
     """The learners side by side, with their weights stacked."""
     group = StackedLearners(learners)
-    group._take()
+    group._load()
     return group
 
 

@@ -7,16 +7,18 @@ that are updated together each get numbers from their own generator.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from threading import local
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 __all__ = [
     "Draw",
+    "drawn_in",
     "given_draws",
     "redrawn",
     "standard_normal",
@@ -70,6 +72,14 @@ def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
         yield
     finally:
         _source.given = None
+
+
+def drawn_in(draws: TensorDictBase | None) -> AbstractContextManager[None]:
+    """Context in which losses take their random numbers from entries "0", "1", ... of ``draws``;
+    with ``None``, from where they take them anyway."""
+    if draws is None:
+        return nullcontext()
+    return given_draws(draws[f"{i}"] for i in range(len(draws.keys())))
 
 
 def redrawn(function: Callable[..., Any]) -> Callable[..., list[Tensor]]:

@@ -1,4 +1,4 @@
-"""Adam that takes gradients as an argument."""
+"""Adam that takes gradients as an argument, and the parameter groups of a learner."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim.adam import Adam, adam
 
-__all__ = ["GradientAdam"]
+from torchrl_etl.learners.term import Term
+
+__all__ = ["GradientAdam", "make_optimizer", "parameter_groups"]
 
 
 class GradientAdam(Adam):
@@ -138,6 +140,29 @@ class GradientAdam(Adam):
             if own:
                 walked.append((group, at, [own, *kept]))
         return walked
+
+
+def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
+    """All trainable parameters, each once: those of terms at their own rates, then SAC's."""
+    groups, known = [], set()
+    of_terms = ((term.loss, lr if term.lr is None else term.lr) for term in terms)
+    for module, rate in (*of_terms, (sac, lr)):
+        fresh = [p for p in module.parameters() if p.requires_grad and id(p) not in known]
+        known |= {id(parameter) for parameter in fresh}
+        if fresh:
+            groups.append({"params": fresh, "lr": rate})
+    return groups
+
+
+def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> GradientAdam:
+    """Fused Adam, which a CUDA graph can capture.
+
+    On CUDA it keeps learning rates in tensors, so that they can change after the capture.
+    """
+    graphed = device.type == "cuda"
+    if graphed:
+        groups = [{**group, "lr": torch.tensor(group["lr"], device=device)} for group in groups]
+    return GradientAdam(list(groups), fused=True, capturable=graphed)
 
 
 def _set_rate(group: dict[str, Any], rate: float) -> None:

@@ -1,10 +1,8 @@
-"""Parts of a SAC learner: losses, reward scaling, parameter groups and their optimizer."""
+"""Parts of a SAC learner: loss, reward scaling, target entropy, and the policy that acts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -15,26 +13,20 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded
 
 from torchrl_etl.checks import check_integer, check_real, renaming
-from torchrl_etl.draws import given_draws
-from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.objective import NORMALIZED
-from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm, SynergyMap
 from torchrl_etl.objectives import LeanSACLoss, SynergySACLoss
 
 __all__ = [
-    "drawn_in",
     "entropy_target",
     "episode_numbers",
     "from_observation",
     "make_loss",
-    "make_optimizer",
     "make_return_scale",
-    "parameter_groups",
 ]
 
 
@@ -120,13 +112,6 @@ def support(bins: int, bound: float | None) -> Tensor | None:
     return torch.linspace(-bound, bound, bins)
 
 
-def drawn_in(draws: TensorDictBase | None) -> AbstractContextManager[None]:
-    """Context in which losses take their random numbers from entries "0", "1", ... of ``draws``."""
-    if draws is None:
-        return nullcontext()
-    return given_draws(draws[f"{i}"] for i in range(len(draws.keys())))
-
-
 def episode_numbers(batch: TensorDictBase) -> Tensor:
     """An episode number for each transition [*], unique across workers.
 
@@ -135,26 +120,3 @@ def episode_numbers(batch: TensorDictBase) -> Tensor:
     number = batch["collector", "traj_ids"]
     worker = batch.get(("collector", "worker"), None)
     return number if worker is None else number + (worker << 32)
-
-
-def parameter_groups(sac: nn.Module, terms: Sequence[Term], lr: float) -> list[dict[str, Any]]:
-    """All trainable parameters, each once: those of terms at their own rates, then SAC's."""
-    groups, known = [], set()
-    of_terms = ((term.loss, lr if term.lr is None else term.lr) for term in terms)
-    for module, rate in (*of_terms, (sac, lr)):
-        fresh = [p for p in module.parameters() if p.requires_grad and id(p) not in known]
-        known |= {id(parameter) for parameter in fresh}
-        if fresh:
-            groups.append({"params": fresh, "lr": rate})
-    return groups
-
-
-def make_optimizer(groups: Sequence[dict[str, Any]], device: torch.device) -> GradientAdam:
-    """Fused Adam, which a CUDA graph can capture.
-
-    On CUDA it keeps learning rates in tensors, so that they can change after the capture.
-    """
-    graphed = device.type == "cuda"
-    if graphed:
-        groups = [{**group, "lr": torch.tensor(group["lr"], device=device)} for group in groups]
-    return GradientAdam(list(groups), fused=True, capturable=graphed)

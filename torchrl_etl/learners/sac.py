@@ -20,18 +20,16 @@ from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_real
-from torchrl_etl.draws import redrawn
+from torchrl_etl.draws import drawn_in, redrawn
+from torchrl_etl.learners.adam import make_optimizer, parameter_groups
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import Objective
 from torchrl_etl.learners.parts import (
-    drawn_in,
     episode_numbers,
     from_observation,
     make_loss,
-    make_optimizer,
     make_return_scale,
-    parameter_groups,
 )
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import RunningNorm, SynergyMap

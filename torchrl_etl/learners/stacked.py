@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_etl.draws import drawn_in
 from torchrl_etl.learners.objective import Objective
-from torchrl_etl.learners.parts import drawn_in
 from torchrl_etl.learners.sac import Gradients, SACLearner
 
 __all__ = ["StackedLearners"]
@@ -68,18 +68,18 @@ class StackedLearners:
         self._stacks: dict[int, Tensor] = {}
         self._whole = whole(learners[0].objective)
         self._checked = not learners[0].objective.transforms
-        self._all = learners[0].mapped(self._stack, self.gradients)
+        self._stacked = learners[0].mapped(self._stack, self.gradients)
 
     def updates(self, inputs: Sequence[TensorDictBase]) -> list[TensorDictBase]:
         """Run k updates of every learner on its own :meth:`SACLearner.inputs` [k]; returns the
         scalars [k] of each."""
-        self._take()
-        stacked = torch.stack(list(inputs), 1)
+        self._load()
+        of_all = torch.stack(list(inputs), 1)
         if not self._checked:
-            self._check(stacked[0])
+            self._check(of_all[0])
             self._checked = True
-        scalars = self._all.updates(stacked)
-        self._give_back()
+        scalars = self._stacked.updates(of_all)
+        self._store()
         return list(scalars.unbind(1))
 
     def gradients(self, inputs: TensorDictBase) -> Gradients:
@@ -90,12 +90,12 @@ class StackedLearners:
         """
         first = self.learners[0]
 
-        def loss(held: TensorDictBase, own: TensorDictBase) -> tuple[Any, ...]:
-            with held.to_module(self._whole, preserve_module_state=False):
+        def loss(tensors: TensorDictBase, own: TensorDictBase) -> tuple[Any, ...]:
+            with tensors.to_module(self._whole, preserve_module_state=False):
                 return first.loss(own["batch"], own["draws"])
 
-        losses, scalars, statistics = torch.vmap(loss)(self._held(), inputs)
-        gradients = torch.autograd.grad(losses.sum(), self._all.parameters, allow_unused=True)
+        losses, scalars, statistics = torch.vmap(loss)(self._tensors(), inputs)
+        gradients = torch.autograd.grad(losses.sum(), self._stacked.parameters, allow_unused=True)
         return gradients, scalars.detach(), statistics
 
     @torch.no_grad()
@@ -107,12 +107,12 @@ class StackedLearners:
             with drawn_in(own["draws"]):
                 return objective.prepare(own["batch"])["next", objective.reward]
 
-        def of_the_first(held: TensorDictBase, own: TensorDictBase) -> Tensor:
-            with held.to_module(self._whole, preserve_module_state=False):
+        def of_the_first(tensors: TensorDictBase, own: TensorDictBase) -> Tensor:
+            with tensors.to_module(self._whole, preserve_module_state=False):
                 return reward(first, own)
 
-        with _as_it_was(self._all):
-            together = torch.vmap(of_the_first)(self._held(), inputs)
+        with _as_it_was(self._stacked):
+            together = torch.vmap(of_the_first)(self._tensors(), inputs)
         for each, own, found in zip(self.learners, inputs, together, strict=True):
             with _as_it_was(each):
                 alone = reward(each.objective, own)
@@ -125,16 +125,16 @@ class StackedLearners:
                     "attribute networks, a tuple."
                 )
 
-    def _held(self) -> TensorDictBase:
+    def _tensors(self) -> TensorDictBase:
         """Tensors that the learners' objectives hold or read [seeds]: the stacks, and constant
         tensors stacked on the fly."""
 
-        def stacked(*own: Tensor) -> Tensor:
+        def stack(*own: Tensor) -> Tensor:
             found = self._stacks.get(id(own[0]))
             return torch.stack(own) if found is None else found
 
-        held, *others = (TensorDict.from_module(whole(each.objective)) for each in self.learners)
-        return held.apply(stacked, *others, batch_size=[len(self.learners)])
+        first, *others = (TensorDict.from_module(whole(each.objective)) for each in self.learners)
+        return first.apply(stack, *others, batch_size=[len(self.learners)])
 
     def _stack(self, own: Tensor) -> Tensor:
         """The stack in which a tensor of the first learner and its counterparts are updated."""
@@ -144,30 +144,32 @@ class StackedLearners:
         return self._stacks[id(own)]
 
     @torch.no_grad()
-    def _take(self) -> None:
+    def _load(self) -> None:
+        """Copy the learners' tensors, update counts and rates into the stacks."""
         if len(differing := {learner.step_sizes for learner in self.learners}) > 1:
             raise ValueError(
                 "The learners' updates and rates differ "
                 f"({'; '.join(map(str, sorted(differing)))}); learners that are updated side by "
                 "side need as many updates and the same settings."
             )
-        first = self.learners[0].optimizer
+        first, stacked = self.learners[0].optimizer, self._stacked.optimizer
         torch._foreach_copy_(*self._rows_and_own())
-        torch._foreach_copy_(self._all.optimizer.steps, first.steps)
-        for group, own in zip(self._all.optimizer.param_groups, first.param_groups, strict=True):
+        torch._foreach_copy_(stacked.steps, first.steps)
+        for group, own in zip(stacked.param_groups, first.param_groups, strict=True):
             group["lr"] = own["lr"]
 
     @torch.no_grad()
-    def _give_back(self) -> None:
+    def _store(self) -> None:
+        """Copy the stacks' tensors and update counts back into the learners."""
         rows, own = self._rows_and_own()
         torch._foreach_copy_(own, rows)
         for learner in self.learners:
-            torch._foreach_copy_(learner.optimizer.steps, self._all.optimizer.steps)
-            learner.ema.n_averaged.copy_(self._all.ema.n_averaged)
+            torch._foreach_copy_(learner.optimizer.steps, self._stacked.optimizer.steps)
+            learner.ema.n_averaged.copy_(self._stacked.ema.n_averaged)
 
     def _rows_and_own(self) -> tuple[list[Tensor], list[Tensor]]:
         """Rows of the stacks, learner by learner, and the learners' own tensors."""
-        rows = zip(*(stack.unbind(0) for stack in self._all.state), strict=True)
+        rows = zip(*(stack.unbind(0) for stack in self._stacked.state), strict=True)
         own = (learner.state for learner in self.learners)
         return [row for each in rows for row in each], [tensor for each in own for tensor in each]
 
