@@ -275,7 +275,7 @@ def test_both_stages_run_with_every_kind(kind: str, tmp_path) -> None:
 @pytest.mark.parametrize("kind", AFFINE)
 def test_affine_synergies_add_no_loss_to_stage_1(kind: str) -> None:
     found = explorer(f"synergies={kind}")
-    assert found.term is None and found.model.loss is None
+    assert found.model.loss is None and not len(found.fitter.objective.terms)
     for _ in range(6):
         found.stage.collect()
     found.stage.update()

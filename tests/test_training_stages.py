@@ -186,11 +186,11 @@ def test_final_updates_are_adam_steps_of_the_synergy_model_alone():
     before = [snapshot(part) for part in others]
     inputs = found.fitter.inputs(found.stage.samples(3))
     found.fitter.updates(inputs)
-    adam = torch.optim.Adam(twin.model.model.parameters(), lr=found.term.lr)
+    adam = torch.optim.Adam(twin.model.model.parameters(), lr=found.model.lr)
     for each in inputs.unbind(0):
         adam.zero_grad()
         with given_draws(each["draws"][name] for name in sorted(each["draws"].keys())):
-            twin.term(each["batch"])[0].backward()
+            twin.fitter.objective.terms[0](each["batch"])[0].backward()
         adam.step()
     for name, weight in twin.model.model.state_dict().items():
         torch.testing.assert_close(found.model.model.state_dict()[name], weight)

@@ -123,19 +123,12 @@ def check_width(size: int, **tensors: Tensor) -> None:
             )
 
 
-class _NamedInFull(ValueError):
-    """An error whose message has the full key already."""
-
-
 @contextmanager
-def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
+def naming(section: str) -> Iterator[None]:
     """Prefix the errors of argument checks with a section of the configuration.
 
     Args:
         section (str): its name. Nested calls of ``naming`` prepend theirs.
-
-    Keyword Args:
-        in_full (bool): whether outer calls prepend nothing. Default: ``False``.
 
     Examples:
         >>> with naming("learn.sac"):
@@ -146,11 +139,8 @@ def naming(section: str, *, in_full: bool = False) -> Iterator[None]:
     """
     try:
         yield
-    except _NamedInFull:
-        raise
     except ValueError as error:
-        kind = _NamedInFull if in_full else type(error)
-        raise kind(f"{section}.{error}") from error
+        raise type(error)(f"{section}.{error}") from error
 
 
 @contextmanager

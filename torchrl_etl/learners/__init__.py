@@ -1,6 +1,5 @@
 """Learners: networks, losses, targets and optimizer behind one update."""
 
-from torchrl_etl.learners.build import build_learner
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
 from torchrl_etl.learners.parts import entropy_target, from_observation
@@ -15,7 +14,6 @@ __all__ = [
     "StackedLearners",
     "Term",
     "WarmedUpEMA",
-    "build_learner",
     "entropy_target",
     "from_observation",
 ]

@@ -36,10 +36,10 @@ class DEP(Method):
         with naming("method.options"):
             controller = DEPExploration(self.context.spec.action_spec, **self.options)
         controller.dep_frames = self.context.actions(self.options["dep_frames"])
-        learner = self.context.learner(
-            wrap_behavior=lambda behavior: TensorDictSequential(behavior, controller),
-            extra_options=lambda actor: {"on_restart": [partial(setattr, controller, "frames")]},
-        )
+        actor = self.context.actor()
+        behavior = TensorDictSequential(self.context.behavior(actor), controller)
+        counter = partial(setattr, controller, "frames")
+        learner = self.context.learner(actor, behavior=behavior, on_restart=[counter])
         return self.context.stage(learner, env_options={"muscle_lengths": True})
 
     def check(self) -> None:

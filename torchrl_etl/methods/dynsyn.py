@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-from tensordict.nn import ProbabilisticTensorDictSequential
-from torchrl.data import Bounded
 
 from torchrl_etl.baselines import (
     group_muscles,
@@ -19,7 +15,6 @@ from torchrl_etl.baselines import (
 )
 from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.io import read_json, write_atomically
-from torchrl_etl.learners import entropy_target
 from torchrl_etl.methods.method import Method
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
@@ -98,22 +93,11 @@ class DynSyn(Method):
             deviation |= {"start": start, "slope": deviation["ceiling"] / (frames - start)}
         with naming("method.options"):  # the actor checks them
             make_dynsyn_actor({"observation": 1}, spec, groups, **deviation)
-
-        def make_actor(
-            inputs: Mapping[str, int], spec: Bounded, **options: Any
-        ) -> ProbabilisticTensorDictSequential:
-            return make_dynsyn_actor(inputs, spec, groups, **options, **deviation)
-
-        def entropy(spec: Bounded, action_std: float | None) -> float:
-            # The actor's log-probability has one dimension per group.
-            first = [groups.index(group) for group in sorted(set(groups))]
-            return entropy_target(spec[first], action_std)
-
         self.context.seed_everything("learn")
+        actor = self.context.actor(make=make_dynsyn_actor, groups=groups, **deviation)
+        # The actor's log-probability has one dimension per group.
+        first = [groups.index(group) for group in sorted(set(groups))]
         learner = self.context.learner(
-            make_actor=make_actor,
-            make_behavior=lambda actor: actor,
-            entropy=entropy,
-            extra_options=lambda actor: {"on_frames": [partial(set_frames, actor)]},
+            actor, entropy_spec=spec[first], on_frames=[partial(set_frames, actor)]
         )
         return self.context.stage(learner)

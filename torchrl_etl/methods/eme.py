@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from tensordict.nn import ProbabilisticTensorDictSequential
-
 from torchrl_etl.baselines import EMEBonus, EMELoss, RewardEnsemble
 from torchrl_etl.checks import naming
 from torchrl_etl.learners import Term
@@ -41,12 +37,13 @@ class EME(Method):
             ensemble = RewardEnsemble(*sizes, options["ensemble"], hidden=options["hidden"])
             scale = {key: options[key] for key in ("weight", "normalize", "max_scale")}
             bonus = EMEBonus(encoder.to(device), ensemble.to(device), **scale)
-
-        def extra_options(actor: ProbabilisticTensorDictSequential) -> dict[str, Any]:
+        actor = self.context.actor()
+        with naming("learn.sac"):
             gamma = self.context.config.learn.sac.gamma
             loss = EMELoss(encoder, ensemble, actor, gamma=gamma).to(device)
-            with naming("method.options", in_full=True):
-                term = Term(loss, lr=options["lr"], tau=options["tau"])
-            return {"terms": [term], "transforms": [bonus], "reward": "total_reward"}
-
-        return self.context.stage(self.context.learner(extra_options=extra_options))
+        with naming("method.options"):
+            term = Term(loss, lr=options["lr"], tau=options["tau"])
+        learner = self.context.learner(
+            actor, terms=[term], transforms=[bonus], reward="total_reward"
+        )
+        return self.context.stage(learner)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -16,10 +15,10 @@ from torchrl_etl.analysis import describe_synergies, direction_alignment
 from torchrl_etl.checks import check_choice, check_real, naming, renaming
 from torchrl_etl.envs import body_synergies, resolve_task
 from torchrl_etl.io import surviving_folder, write_atomically
-from torchrl_etl.learners import Term, entropy_target
+from torchrl_etl.learners import Term
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
-from torchrl_etl.modules import SynergyDecoder, make_actor
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import (
     BundleInfo,
@@ -276,14 +275,12 @@ class ETL(Method):
         entropy_dims = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
         self.context.seed_everything("learn")
         learner = self.context.learner(
+            self.context.actor(decoder=decoder, **self._quiet),
             decoder=decoder,
-            make_actor=partial(make_actor, **self._quiet),
-            entropy=lambda emitted, std: entropy_target(emitted[:entropy_dims], std),
-            extra_options=lambda actor: {
-                "train_decoder": mode == "critic",
-                "terms": [term],
-                "entropy_dims": entropy_dims,
-            },
+            train_decoder=mode == "critic",
+            terms=[term],
+            entropy_spec=decoder.synergy_spec[:entropy_dims],
+            entropy_dims=entropy_dims,
         )
         room = self.context.config.explore.frames if self.prefills else 0
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)

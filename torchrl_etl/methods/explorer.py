@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
 
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
@@ -55,30 +54,25 @@ class Explorer:
         self.relabel = self.exploration.relabel_transforms()
         for transform in self.relabel:
             transform.to(context.device)
-
+        actor = context.actor("explore", inputs=self.exploration.inputs)
+        with naming("explore.fit"):
+            self.selector = ActionSelector(actor, **fit)
         with naming("exploration"):
-            terms = list(self.exploration.terms())
-
-        def extra_options(actor: ProbabilisticTensorDictSequential) -> dict[str, Any]:
-            with naming("fit"):
-                self.selector = ActionSelector(actor, **fit)
-            self.term = None
-            if self.model.loss is not None:
-                self.term = Term(self.model.loss, lr=self.model.lr, inputs=self.selector)
-                terms.append(self.term)
-            return {
-                "terms": terms,
-                "transforms": self.exploration.batch_transforms(),
-                "reward": self.exploration.reward,
-            }
-
+            terms = self.exploration.terms()
+        fitted = []
+        if self.model.loss is not None:
+            with naming("synergies"):
+                fitted = [Term(self.model.loss, lr=self.model.lr, inputs=self.selector)]
         learner = context.learner(
+            actor,
             "explore",
             inputs=self.exploration.inputs,
-            wrap_behavior=self.exploration.behavior,
-            extra_options=extra_options,
+            behavior=self.exploration.behavior(context.behavior(actor, "explore")),
+            terms=[*terms, *fitted],
+            transforms=self.exploration.batch_transforms(),
+            reward=self.exploration.reward,
         )
-        self.fitter = learner.only(*([] if self.term is None else [self.term]))
+        self.fitter = learner.only(*fitted)
         env_options = {"activations": True} if fit["actions"] == "activation" else {}
         self.stage = context.stage(
             learner,
@@ -95,7 +89,7 @@ class Explorer:
         """Stage arguments that replace or defer updates if the exploration does not learn."""
         if self.exploration.trains_policy:
             return {}
-        if self.term is None:  # the model is fitted once, on all actions
+        if self.model.loss is None:  # the model is fitted once, on all actions
             return {"learning_starts": sys.maxsize}
         return {"updated": self.fitter}
 
@@ -105,7 +99,7 @@ class Explorer:
         ``on_update`` is called before every few updates and may raise to stop.
         """
         torch.manual_seed(self.seed)  # the same whether or not the run was resumed
-        if self.term is None:
+        if self.model.loss is None:
             self.model.fit(self.actions(), on_update=on_update)
         else:
             for few in self.stage.updates(self.final_updates, self.fitter, "synergies"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -46,8 +45,5 @@ class Lattice(Method):
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")
-        learner = self.context.learner(
-            make_actor=partial(make_lattice_actor, **self.actor_options),
-            make_behavior=self.behavior,
-        )
-        return self.context.stage(learner)
+        actor = self.context.actor(make=make_lattice_actor, **self.actor_options)
+        return self.context.stage(self.context.learner(actor, behavior=self.behavior(actor)))

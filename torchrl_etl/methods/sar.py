@@ -159,10 +159,9 @@ class SAR(Method):
         if decoder is None:
             decoder = self._placeholder()
         self.context.seed_everything("learn")
-        learner = self.context.learner(
-            decoder=decoder.to(self.context.device),
-            extra_options=lambda actor: {"terms": [Term(DecoderLoss(decoder), weight=0.0)]},
-        )
+        decoder = decoder.to(self.context.device)
+        term = Term(DecoderLoss(decoder), weight=0.0)
+        learner = self.context.learner(decoder=decoder, terms=[term])
         return self.context.stage(learner, keep=("synergy",))
 
 

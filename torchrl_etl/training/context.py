@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torchrl.collectors import Collector
+from torchrl.data import Bounded
 from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from torchrl_etl.checks import check_integer, naming
+from torchrl_etl.checks import check_choice, check_flag, check_integer, naming
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.extras import extra
-from torchrl_etl.learners import SACLearner, build_learner
+from torchrl_etl.learners import NORMALIZED, SACLearner, entropy_target
+from torchrl_etl.modules import (
+    HeldNoise,
+    RunningNorm,
+    SynergyMap,
+    UniformWarmup,
+    make_actor,
+    make_critic,
+)
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
@@ -28,6 +42,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 __all__ = ["Context"]
+
+Actor: TypeAlias = ProbabilisticTensorDictSequential
 
 NOT_OF_THE_STAGE = (
     *("actor", "critic", "sac", "noise", "init_random_frames"),  # the learner's
@@ -83,33 +99,125 @@ class Context:
             "env_kwargs": self.options("env_kwargs"),
         }
 
-    def learner(
-        self, section: str = "learn", *, spec: EnvironmentSpec | None = None, **parts: Any
-    ) -> SACLearner:
-        """Build the learner that ``section`` configures.
+    def actor(
+        self,
+        section: str = "learn",
+        *,
+        spec: EnvironmentSpec | None = None,
+        decoder: SynergyMap | None = None,
+        inputs: Mapping[str, int] | None = None,
+        make: Callable[..., Actor] = make_actor,
+        **options: Any,
+    ) -> Actor:
+        """Build the actor that ``section`` configures.
 
         Args:
             section (str): ``"explore"`` or ``"learn"``.
 
         Keyword Args:
-            spec (EnvironmentSpec, optional): environment to learn in. Default: the run's.
-            **parts: see :func:`~torchrl_etl.learners.build_learner`.
+            spec (EnvironmentSpec, optional): environment to act in. Default: the run's.
+            decoder (SynergyMap, optional): maps its outputs to actions. Default: they are actions.
+            inputs (mapping, optional): sizes of its inputs besides the observation, by key.
+            make (callable): builds it. Default: :func:`~torchrl_etl.modules.make_actor`.
+            **options: arguments of ``make`` besides the configured ones.
         """
         spec = spec or self.spec
+        output, out_key = spec.action_spec, "action"
+        if decoder is not None:
+            output, out_key = decoder.to(self.device).synergy_spec, decoder.in_keys[0]
+        sizes, configured = self._inputs(section, spec, inputs), self.options(section)["actor"]
+        with naming(f"{section}.actor"):
+            return make(sizes, output, out_key=out_key, **configured, **options).to(self.device)
+
+    def behavior(self, actor: Actor, section: str = "learn") -> TensorDictModuleBase:
+        """The actor with exploration noise, drawn at every step or held for several."""
+        noise = self.options(section)["noise"]
+        with naming(f"{section}.noise"):
+            check_choice("kind", kind := noise.pop("kind"), ("independent", "held"))
+            return HeldNoise(actor, **noise) if kind == "held" else actor
+
+    def learner(
+        self,
+        actor: Actor | None = None,
+        section: str = "learn",
+        *,
+        spec: EnvironmentSpec | None = None,
+        decoder: SynergyMap | None = None,
+        inputs: Mapping[str, int] | None = None,
+        behavior: TensorDictModuleBase | None = None,
+        entropy_spec: Bounded | None = None,
+        **parts: Any,
+    ) -> SACLearner:
+        """Build critics and the learner that ``section`` configures.
+
+        Args:
+            actor (ProbabilisticTensorDictSequential, optional): Default: :meth:`actor`.
+            section (str): ``"explore"`` or ``"learn"``.
+
+        Keyword Args:
+            spec, decoder, inputs: those of the actor.
+            behavior (TensorDictModuleBase, optional): policy that collects, after
+                ``init_random_frames`` of uniform actions. Default: :meth:`behavior`.
+            entropy_spec (Bounded, optional): spec of the outputs whose entropy has a target.
+                Default: all outputs of the actor.
+            **parts: arguments of :class:`~torchrl_etl.learners.SACLearner` besides the configured
+                ones, such as ``terms``.
+        """
+        spec, options = spec or self.spec, self.options(section)
+        if actor is None:
+            actor = self.actor(section, spec=spec, decoder=decoder, inputs=inputs)
+        if behavior is None:
+            behavior = self.behavior(actor, section)
+        output = actor.spec[out_key := actor.dist_sample_keys[0]]
+        if uniform := self._uniform_actions(section):
+            warmup = UniformWarmup(output, uniform, action_key=out_key)
+            behavior = TensorDictSequential(behavior, warmup)
+            parts["on_restart"] = [*parts.get("on_restart", ()), partial(setattr, warmup, "seen")]
+        sizes = self._inputs(section, spec, inputs)
+        with naming(f"{section}.critic"):
+            critic = make_critic({**sizes, "action": spec.action_dim}, **options["critic"])
+        normalizer = RunningNorm(spec.observation_dim) if NORMALIZED in sizes else None
+        sac = options["sac"] | {"compile": self._compiles(section)}
+        del sac["normalize_observations"]  # read by self._inputs
+        with naming(f"{section}.sac"):
+            entropy_spec = output if entropy_spec is None else entropy_spec
+            return SACLearner(
+                actor,
+                critic.to(self.device),
+                action_spec=output,
+                decoder=decoder,
+                behavior=behavior,
+                normalizer=normalizer,
+                target_entropy=entropy_target(entropy_spec, sac.pop("action_std")),
+                bins=options["critic"].get("bins", 1),
+                **sac,
+                **parts,
+            )
+
+    def _inputs(
+        self, section: str, spec: EnvironmentSpec, others: Mapping[str, int] | None
+    ) -> dict[str, int]:
+        """Sizes of the inputs that actor and critics share, by key."""
+        normalize = self.options(section)["sac"]["normalize_observations"]
+        with naming(f"{section}.sac"):
+            check_flag(normalize_observations=normalize)
+        return {NORMALIZED if normalize else "observation": spec.observation_dim, **(others or {})}
+
+    def _uniform_actions(self, section: str) -> int:
+        """Actions of each worker that are drawn uniformly at first."""
+        frames = self.options(section).get("init_random_frames", 0)
+        with naming(section):
+            check_integer(0, init_random_frames=frames)
+        return self.actions(frames)
+
+    def _compiles(self, section: str) -> bool:
+        """Whether to compile updates; by default if the run is long enough to save time."""
+        if self.config.compile is not None:
+            return self.config.compile
         options = self.options(section)
-        configured = {key: options[key] for key in ("actor", "critic", "sac", "noise")}
-        compile = self.config.compile
-        if compile is None:  # compile only if the run is long enough to save time
-            with naming(section):
-                check_budget(options["frames"], options["replay_ratio"])
-            compile = options["frames"] * options["replay_ratio"] >= 4_000
-        configured["sac"]["compile"] = compile
-        random = options.get("init_random_frames", 0)
         with naming(section):
-            check_integer(0, init_random_frames=random)
-        configured["init_random_actions"] = self.actions(random)
-        with naming(section):
-            return build_learner(spec.observation_dim, spec.action_spec, **{**configured, **parts})
+            check_budget(options["frames"], options["replay_ratio"])
+        return options["frames"] * options["replay_ratio"] >= 4_000
 
     def stage(
         self,
