@@ -1,16 +1,14 @@
 """Checks that every LatentAction must pass, and a decoder with fixed weights."""
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
-from torchrl.envs import Compose, StepCounter
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, StepCounter, TransformedEnv
 
-from tests.point_env import ACTION_DIM, move
+from tests.point_env import ACTION_DIM, PointEnv, move
 from tests.transform_checks import TransformChecks
 from torchrl_etl.modules import SynergyDecoder
 
@@ -28,6 +26,14 @@ def decode(synergy, decoder=None):
     decoder = decoder or fixed_decoder()
     with torch.no_grad():
         return decoder.module(synergy)
+
+
+def make_buffer(**kwargs):
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(4), **kwargs)
+
+
+def refused_in_a_buffer():
+    return pytest.raises(RuntimeError, match="In a replay buffer it would overwrite recorded")
 
 
 class LatentActionChecks(TransformChecks):
@@ -79,10 +85,10 @@ class LatentActionChecks(TransformChecks):
             transform(TensorDict({self.latent_key: torch.zeros(D)}))
 
     def test_compose(self):
-        latent = torch.linspace(-1, 1, 3 * D).view(3, D)
-        data = TensorDict({self.latent_key: latent}, [3])
-        decoded = Compose(self.transform(), StepCounter()).inv(data)
-        torch.testing.assert_close(decoded["action"], decode(latent))
+        data = TensorDict({self.latent_key: torch.zeros(3, D)}, [3])
+        pipeline = Compose(self.transform(), StepCounter())
+        with pytest.raises(RuntimeError, match="inverse pass of an env only"):
+            pipeline.inv(data)
 
     def test_model(self):
         network = TensorDictModule(nn.Linear(3, D), ["observation"], [self.latent_key])
@@ -95,31 +101,39 @@ class LatentActionChecks(TransformChecks):
                 model(data)
 
     def test_replay_buffer(self):
-        refused = partial(pytest.raises, TypeError, match="cannot be attached to a replay buffer")
-        storage = partial(LazyTensorStorage, 4)
-        with refused():
-            ReplayBuffer(storage=storage(), transform=self.transform())
-        with refused():
-            TensorDictReplayBuffer(storage=storage(), transform=Compose(self.transform()))
-        # TorchRL calls a transform factory at the first use of the buffer.
-        buffer = TensorDictReplayBuffer(storage=storage(), transform_factory=self.transform)
-        with refused():
-            buffer.extend(TensorDict({self.latent_key: torch.zeros(4, D)}, [4]))
-        buffer = TensorDictReplayBuffer(storage=storage())
-        with refused():
-            buffer.append_transform(self.transform())
-        with refused():
-            buffer.insert_transform(0, self.transform())
-        with refused():
-            buffer.append_transform(Compose(StepCounter(), self.transform()))
-        buffer.append_transform(StepCounter())
+        data = self.env().rollout(4)
+        data[self.latent_key] = torch.zeros(4, D)
+        buffers = {
+            "constructed": make_buffer(transform=self.transform()),
+            "composed": make_buffer(transform=Compose(self.transform())),
+            "at first use": make_buffer(transform_factory=self.transform),
+            "appended": make_buffer().append_transform(self.transform()),
+            "inserted": make_buffer().insert_transform(0, self.transform()),
+            "appended in a Compose": make_buffer().append_transform(
+                Compose(StepCounter(), self.transform())
+            ),
+        }
+        for buffer in buffers.values():
+            with refused_in_a_buffer():
+                buffer.extend(data)
+            assert not len(buffer)
+        pipeline = TransformedEnv(PointEnv(), Compose(self.transform())).transform
+        buffer = make_buffer(transform=pipeline)
+        buffer.extend(data)  # looks like a step of the env
+        with refused_in_a_buffer():
+            buffer.sample(2)
 
     def test_inverse(self):
         latent = torch.full((3, D), 0.5, requires_grad=True)
         data = TensorDict({self.latent_key: latent}, [3])
-        decoded = self.transform().inv(data)["action"]
+        with pytest.raises(RuntimeError, match="call its decode"):
+            self.transform().inv(data)
+        decoded = self.transform().decode(latent)
         torch.testing.assert_close(decoded, decode(latent))
         assert not decoded.requires_grad
+        env = self.env(batch_size=(3,))
+        inverted = env.transform.inv(data)
+        torch.testing.assert_close(inverted["action"], decode(latent))
         assert data[self.latent_key] is latent, "the input is left alone"
         with pytest.raises(KeyError, match="let the policy write it"):
-            self.transform().inv(TensorDict())
+            env.transform.inv(TensorDict())

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +12,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Composite, ReplayBuffer, TensorSpec
-from torchrl.envs.transforms import ModuleTransform, TransformedEnv
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import ModuleTransform, Transform, TransformedEnv
 
 from torchrl_etl.transforms.keys import (
     check_network,
@@ -23,12 +23,6 @@ from torchrl_etl.transforms.keys import (
     set_leaf,
     set_where_reset,
 )
-
-if TYPE_CHECKING:
-    from types import FrameType
-
-    from torchrl.envs import EnvBase
-    from torchrl.envs.transforms import Transform
 
 __all__ = ["LatentAction"]
 
@@ -56,8 +50,8 @@ class LatentAction(ModuleTransform):
     mode, as TorchRL does with every module. Pass a copy if a learner trains the original. In
     another process the module is the copy made when the worker started.
 
-    LatentAction refuses a replay buffer. Buffers call the inverse of a transform on ``extend``,
-    which would overwrite recorded actions.
+    Outside an environment it raises: a replay buffer would call the inverse on ``extend`` and
+    overwrite recorded actions. To decode elsewhere, call :meth:`decode`.
 
     Args:
         module (TensorDictModuleBase): reads one latent action and writes one action within the
@@ -79,10 +73,10 @@ class LatentAction(ModuleTransform):
         under a collector, ``action`` [*, n]. For a group of agents, give keys inside the group.
 
     Raises:
-        TypeError: if the module lacks keys, or the transform is put on a replay buffer.
+        TypeError: if the module lacks keys.
         ValueError: if keys collide; when attached to an env, if the env has no such action key or
             the module's actions have another shape.
-        RuntimeError: if called forward: it does not encode actions.
+        RuntimeError: if called forward or inverted outside an env, as by a replay buffer.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
@@ -144,6 +138,8 @@ class LatentAction(ModuleTransform):
         return private_key(self.executed_key, self.decoded_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.parent is None:
+            raise self._outside_an_env()
         latent = tensordict.get(self.latent_key, None)
         if latent is None:
             if self.missing_tolerance:
@@ -170,9 +166,13 @@ class LatentAction(ModuleTransform):
         return action if self.parent is None else action.to(self._action_leaf.dtype)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise RuntimeError(
-            f"{type(self).__name__} acts in the inverse pass of an env only; to decode elsewhere "
-            "call its inv(tensordict) or the module itself."
+        raise self._outside_an_env()
+
+    def _outside_an_env(self) -> RuntimeError:
+        return RuntimeError(
+            f"{type(self).__name__} acts in the inverse pass of an env only; attach it to the env. "
+            "In a replay buffer it would overwrite recorded actions on extend. To decode "
+            "elsewhere, call its decode(latent) or the module itself."
         )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -273,7 +273,6 @@ class LatentAction(ModuleTransform):
         return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        _refuse_replay_buffer(type(self).__name__)
         super().set_container(container)
         if self.parent is None:  # a Compose that is not in an env yet
             return
@@ -282,11 +281,6 @@ class LatentAction(ModuleTransform):
         except ValueError:
             self.reset_parent()
             raise
-
-    def train(self, mode: bool = True) -> LatentAction:
-        # A buffer does not re-attach a ready-made Compose, but it puts it in eval mode.
-        _refuse_replay_buffer(type(self).__name__)
-        return super().train(mode)
 
     def _check_env(self, env: EnvBase) -> None:
         name, actions = type(self).__name__, env.full_action_spec
@@ -331,19 +325,3 @@ def _without(spec: Composite, key: NestedKey) -> Composite:
         key = unravel_key(key[:-1])
         del spec[key]
     return spec
-
-
-def _refuse_replay_buffer(name: str) -> None:
-    # A buffer puts its transforms in a Compose without an env, just as an env pipeline is before it
-    # is attached. Only the caller tells the two apart.
-    frame: FrameType | None = sys._getframe(1)
-    while frame is not None:
-        # ``issubclass``, because TorchRL's ``isinstance`` hook queries attributes of its argument,
-        # which fails on half-built envs among the callers.
-        if issubclass(type(frame.f_locals.get("self")), ReplayBuffer):
-            raise TypeError(
-                f"{name} cannot be attached to a replay buffer, because buffers call the "
-                "inverse of their transforms on extend and recorded actions would be overwritten; "
-                "attach it to the env."
-            )
-        frame = frame.f_back

@@ -37,10 +37,10 @@ class SynergyAction(LatentAction):
         ``action`` [*, n] in [low, high].
 
     Raises:
-        TypeError: if the decoder lacks keys or attributes, or the transform is put on a buffer.
+        TypeError: if the decoder lacks keys or attributes.
         ValueError: if keys collide; when attached to an env, if the env has no such action key or
             its number of actuators or bounds are not the decoder's.
-        RuntimeError: if called forward: it does not encode actions.
+        RuntimeError: if called forward or inverted outside an env, as by a replay buffer.
 
     Examples:
         >>> import torch
