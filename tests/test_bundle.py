@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_etl.envs import actuator_names, make_env
-from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules import GMVAE, SARDecoder, SynergyDecoder
 from torchrl_etl.synergies import (
     BundleError,
     BundleInfo,
@@ -83,6 +83,21 @@ def test_round_trip_is_bit_equal(tmp_path, residual):
     assert sorted(os.listdir(folder)) == ["synergies.json", "synergies.safetensors"]
 
 
+def test_round_trip_of_sars_map_keeps_its_kind_and_blend(tmp_path):
+    decoder = SARDecoder.from_basis(torch.zeros(5), torch.rand(2, 5), low=LOW, high=HIGH, blend=0.6)
+    loaded, info = load_bundle(save(decoder, tmp_path / "b"))
+    assert type(loaded) is SARDecoder and loaded.config == decoder.config
+    assert same_weights(decoder, loaded)
+    assert (info.kind, info.residual) == ("sar", 0.4)
+    with pytest.raises(BundleError, match=r"is a SARDecoder, whose residual is fixed at 0\.4"):
+        load_bundle(tmp_path / "b", residual=0.5)
+
+
+def test_description_of_a_synergy_decoder_has_no_kind_as_in_older_bundles(bundle):
+    config = json.loads((bundle / "synergies.json").read_text())["config"]
+    assert list(config) == ["num_synergies", "action_dim", "low", "high", "hidden", "residual"]
+
+
 def test_loads_from_the_run_folder_with_other_keys_and_residual(bundle):
     decoder, info = load_bundle(
         bundle.parent, residual=0.5, in_keys=[("arm", "synergy")], out_keys=[("arm", "action")]
@@ -128,7 +143,8 @@ DAMAGE = {
     r"has unknown \['surprise'\]": lambda f: edit(f, surprise=1),
     "low in .* is 'x'; it must be a JSON array": lambda f: edit(f, low="x"),
     "task in .* is 5; it must be a JSON string": lambda f: edit(f, task=5),
-    "do not make a SynergyDecoder": widen,
+    "do not make a decoder": widen,
+    "files may not import 'antigravity'": lambda f: edit(f, config={"kind": "antigravity:Map"}),
     "unexpected keyword argument": lambda f: edit(f, config={"cells": 3}),
     "synergies of 1 actuators": lambda f: edit(f, actuators=["biceps"]),
     "states 99 synergies": lambda f: edit(f, num_synergies=99),

@@ -24,7 +24,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.exploration import Exploration
 from torchrl_etl.export import command_of
 from torchrl_etl.methods.explorer import Explorer
-from torchrl_etl.modules import SARDecoder, SynergyDecoder
+from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import SynergyModel, fit_synergies, load_bundle
 from torchrl_etl.training import resumed_config
 
@@ -92,13 +92,6 @@ class Remembering(Logger):
 
     def log_scalar(self, name, value, step=None):
         self.experiment[f"{self.prefix}{name}", step] = value
-
-
-class NoBundle(Learned):
-    """A synergy model whose decoder is no SynergyDecoder."""
-
-    def decoder(self, actions, *, residual=0.0):
-        return SARDecoder.from_basis(actions.mean(0), self.loss.basis.detach(), **self.bounds)
 
 
 @pytest.fixture
@@ -170,18 +163,9 @@ def test_users_logger_gets_the_scalars_and_another_class_is_refused(tmp_path):
     summary = Experiment(config).run()
     returns = summary["learn"]["return"]
     assert Remembering.logged["my/learn/eval/return", 64] == pytest.approx(returns["after"])
-    config.log = ["tests.test_extend:NoBundle"]
-    with pytest.raises(
-        ValueError, match=r"^log is .*no class NoBundle that is derived from Logger"
-    ):
+    config.log = ["tests.test_extend:Learned"]
+    with pytest.raises(ValueError, match=r"^log is .*no class Learned that is derived from Logger"):
         Experiment(config)
-
-
-def test_model_with_an_unsupported_decoder_is_refused_before_stage_1(tmp_path):
-    words = "NoBundle and its decoder is a SARDecoder; bundles and stage 2 need a SynergyDecoder"
-    with pytest.raises(ValueError, match=words):
-        Experiment(config_with_model("NoBundle", tmp_path))
-    assert not (tmp_path / "run").exists()
 
 
 def test_stage_1_with_the_classes_of_the_page_resumes_with_equal_numbers(page_files, tmp_path):

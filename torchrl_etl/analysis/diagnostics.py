@@ -13,14 +13,14 @@ from torchrl_etl.analysis.arrays import as_array, as_matrix
 from torchrl_etl.checks import check_integer
 
 if TYPE_CHECKING:
-    from torchrl_etl.modules import SynergyDecoder
+    from torchrl_etl.modules import SynergyMap
 
 __all__ = ["control_authority", "direction_alignment", "synergy_effects", "synergy_warnings"]
 
 
 @torch.no_grad()
 def control_authority(
-    decoder: SynergyDecoder, num_samples: int = 1024, *, generator: torch.Generator | None = None
+    decoder: SynergyMap, num_samples: int = 1024, *, generator: torch.Generator | None = None
 ) -> Tensor:
     """Fraction of its range over which the synergies move each actuator [n].
 
@@ -29,7 +29,7 @@ def control_authority(
     and 0 for one that never moves. A residual is held at zero. Reports average it over actuators.
 
     Args:
-        decoder (SynergyDecoder): the decoder.
+        decoder (SynergyMap): the decoder.
         num_samples (int): number of random coefficients. Default: 1024.
 
     Keyword Args:
@@ -57,13 +57,13 @@ def control_authority(
 
 
 @torch.no_grad()
-def synergy_effects(decoder: SynergyDecoder) -> Tensor:
+def synergy_effects(decoder: SynergyMap) -> Tensor:
     """Signed change of each actuator when one coefficient goes from -1 to +1 [d, n].
 
     The other coefficients and a residual are 0. A change of 1 is the actuator's whole range.
 
     Args:
-        decoder (SynergyDecoder): the decoder.
+        decoder (SynergyMap): the decoder.
 
     Examples:
         >>> from torchrl_etl.modules import GMVAE, SynergyDecoder
@@ -157,6 +157,6 @@ def synergy_warnings(
     return found
 
 
-def _decode(decoder: SynergyDecoder, synergies: Tensor) -> Tensor:
+def _decode(decoder: SynergyMap, synergies: Tensor) -> Tensor:
     silent = synergies.new_zeros(len(synergies), decoder.synergy_dim - decoder.num_synergies)
     return decoder(torch.cat([synergies, silent], -1).to(decoder.low.device))

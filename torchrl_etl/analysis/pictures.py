@@ -19,7 +19,7 @@ from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figur
 from torchrl_etl.analysis.diagnostics import synergy_effects
 from torchrl_etl.analysis.state_space import embedding
 from torchrl_etl.analysis.statistics import interval
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SynergyMap
 
 __all__ = ["embedding", "learning_curves", "synergy_heatmap", "vaf_curve"]
 
@@ -106,7 +106,7 @@ def learning_curves(
 
 
 def synergy_heatmap(
-    decoder: SynergyDecoder,
+    decoder: SynergyMap,
     names: Sequence[str],
     path: str | os.PathLike[str],
     *,
@@ -119,7 +119,7 @@ def synergy_heatmap(
     :func:`~torchrl_etl.analysis.diagnostics.synergy_effects`.
 
     Args:
-        decoder (SynergyDecoder): the decoder.
+        decoder (SynergyMap): the decoder.
         names (sequence of str): names of the n actuators, in action order.
         path (path-like): where the PNG goes.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +18,7 @@ from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SynergyDecoder, SynergyMap, describe_map, make_map
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import (
     BundleInfo,
@@ -33,6 +33,7 @@ from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
 from torchrl_etl.training.work import Work
+from torchrl_etl.user_code import import_user_module
 
 __all__ = ["ETL", "FineTuning"]
 
@@ -134,17 +135,12 @@ class ETL(Method):
         self.stage()
 
     def _try_out(self, model: SynergyModel) -> None:
-        """Refuse a model whose decoder cannot be saved in a bundle, before stage 1 takes hours."""
+        """Refuse a model whose decoder stage 2 cannot load, before stage 1 takes hours."""
         actions = self.context.spec.action_spec.rand((256,))
         if model.loss is None:
             model.fit(actions)
-        decoder = model.decoder(actions)
-        if not isinstance(decoder, SynergyDecoder):
-            raise ValueError(
-                f"synergies.kind is {self.context.config.synergies.kind} and its decoder is a "
-                f"{type(decoder).__name__}; bundles and stage 2 need a SynergyDecoder, such as one "
-                "from SynergyDecoder.from_directions."
-            )
+        described = describe_map(model.decoder(actions))
+        make_map(described, residual=self.context.config.learn.decoder.residual)
 
     # Stage 1 -----------------------------------------------------------------------------------
 
@@ -196,7 +192,7 @@ class ETL(Method):
             write_atomically(context.folder.explored, safetensors.torch.save(tensors))
         self._save(decoder, explorer.model.kind, **numbers, seed=context.config.seed)
 
-    def _save(self, decoder: SynergyDecoder, kind: str, **known: Any) -> None:
+    def _save(self, decoder: SynergyMap, kind: str, **known: Any) -> None:
         """Save the bundle in the run folder."""
         config = self.context.config
         save_bundle(
@@ -208,7 +204,7 @@ class ETL(Method):
             facts={**known, **facts()},
         )
 
-    def _draw(self, explorer: Explorer, decoder: SynergyDecoder, stop: StopOnSignal) -> None:
+    def _draw(self, explorer: Explorer, decoder: SynergyMap, stop: StopOnSignal) -> None:
         from torchrl_etl.analysis import draw_synergies, embedding
 
         context, curve = self.context, self.context.options("vaf_curve")
@@ -236,7 +232,7 @@ class ETL(Method):
 
     # Stage 2 -----------------------------------------------------------------------------------
 
-    def decoder(self) -> SynergyDecoder | None:
+    def decoder(self) -> SynergyMap | None:
         """The decoder that was given, explored or computed, if it is available already."""
         there = self.given and self.of_body is None
         if there or surviving_folder(self.context.folder.synergies).exists():
@@ -249,17 +245,21 @@ class ETL(Method):
     def frames_before(self) -> int:
         own = self.context.folder.synergies
         if not self.given and surviving_folder(own).exists():
-            return load_bundle(own)[1].facts["frames"]
+            return self._load()[1].facts["frames"]
         return super().frames_before()
 
-    def _load(self) -> tuple[SynergyDecoder, BundleInfo]:
+    def _load(self) -> tuple[SynergyMap, BundleInfo]:
+        kind = self.context.config.synergies.kind or ""
+        if ":" in kind:  # loading a map of the user's own needs its module, others do not
+            with suppress(ImportError):
+                import_user_module(kind.rpartition(":")[0], repr(kind))
         return load_bundle(self.bundle, residual=self.context.config.learn.decoder.residual)
 
     def stage(self) -> Stage:
         decoder = self.decoder()
         return self.learn_stage(self._placeholder() if decoder is None else decoder)
 
-    def learn_stage(self, decoder: SynergyDecoder) -> Stage:
+    def learn_stage(self, decoder: SynergyMap) -> Stage:
         """Build stage 2 with this decoder."""
         options = self.context.options("learn")["decoder"]
         with naming("learn.decoder"):
@@ -309,7 +309,7 @@ class ETL(Method):
             residual=config.learn.decoder.residual,
         )
 
-    def _explored(self, decoder: SynergyDecoder) -> TensorDict:
+    def _explored(self, decoder: SynergyMap) -> TensorDict:
         """Transitions saved by stage 1, with a residual of zero if the decoder has one."""
         file = self.context.folder.explored
         try:

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
 from torchrl_etl.learners import Term
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import SYNERGY_MODELS, ActionSelector, SynergyModel
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.work import Work
@@ -93,7 +93,7 @@ class Explorer:
             return {"learning_starts": sys.maxsize}
         return {"updated": self.fitter}
 
-    def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyDecoder]:
+    def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyMap]:
         """Finish the training of the synergy model; returns the decoder for stage 2.
 
         ``on_update`` is called before every few updates and may raise to stop.
@@ -117,7 +117,7 @@ class Explorer:
             rows = transform(rows)
         return self.selector(self.fitter.objective.prepare(rows))["action"]
 
-    def transitions(self, decoder: SynergyDecoder) -> TensorDictBase:
+    def transitions(self, decoder: SynergyMap) -> TensorDictBase:
         """All transitions of stage 1 for the buffer of stage 2, with the unscaled task reward and
         with coefficients encoded from each executed action.
         """

@@ -3,6 +3,7 @@
 from torchrl_etl.modules.actor_critic import make_actor, make_critic
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder, Posterior
 from torchrl_etl.modules.held_noise import HeldNoise
+from torchrl_etl.modules.maps import MAPS, describe_map, make_map
 from torchrl_etl.modules.policy_function import policy_function
 from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
@@ -14,6 +15,7 @@ from torchrl_etl.modules.uniform_warmup import UniformWarmup
 
 __all__ = [
     "GMVAE",
+    "MAPS",
     "ActionDecoder",
     "GaussianDynamics",
     "HeldNoise",
@@ -25,7 +27,9 @@ __all__ = [
     "SynergyDecoder",
     "SynergyMap",
     "UniformWarmup",
+    "describe_map",
     "make_actor",
     "make_critic",
+    "make_map",
     "policy_function",
 ]

@@ -52,7 +52,8 @@ class SARDecoder(SynergyMap):
     [-1, 1]^n.
 
     Equation: a = φ·inverse(z) + (1 - φ)·a_raw, clamped to the bounds, where inverse undoes the
-    scaling, the independent and the principal components.
+    scaling, the independent and the principal components. Noise that the clamp hides counts as
+    entropy, as in the public code.
 
     Deviates: the paper's critics value the coefficients and the raw action; under
     :class:`~torchrl_etl.objectives.SynergySACLoss` they value the executed action.
@@ -140,14 +141,6 @@ class SARDecoder(SynergyMap):
         decoder.module.basis.copy_(basis.detach())
         return decoder
 
-    def log_slope(self, synergy: Tensor) -> Tensor:
-        """Zero [*]: inside the bounds the raw action moves the action equally far everywhere.
-
-        A clamped action does not move at all, but its noise still counts as entropy, as in the
-        public code.
-        """
-        return synergy.new_zeros(synergy.shape[:-1])
-
     @torch.no_grad()
     def encode(self, action: Tensor | np.ndarray) -> Tensor:
         """Coefficients [*, d] of actions [*, n] by least squares, clamped to [-1, 1]."""
@@ -155,3 +148,7 @@ class SARDecoder(SynergyMap):
         middle = (self.low + self.high) / 2
         synergies = (action - self.residual * middle) / self.module.blend - self.module.mean
         return (synergies @ self.module.basis.pinverse()).clamp(-1, 1)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"blend": self.module.blend}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -95,11 +95,6 @@ class SynergyDecoder(SynergyMap):
     Keys:
         reads ``synergy`` [*, d] (or [*, d+n]) in [-1, 1]; writes ``action`` [*, n] in [low, high].
 
-    Attributes:
-        encoder (GMVAE, optional): frozen copy of the model that the decoder was made from, used by
-            :meth:`encode`. It is not a submodule, so it is neither trained nor in the state dict.
-            With another decoder's weights, also call ``set_encoder(other.encoder)``.
-
     Raises:
         ValueError: if a size is not positive or ρ is outside [0, 1].
 
@@ -139,18 +134,6 @@ class SynergyDecoder(SynergyMap):
             out_keys=[out_keys] if isinstance(out_keys, str) else list(out_keys),
         )
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
-        self.set_encoder(None)
-
-    def set_encoder(self, encoder: GMVAE | None) -> None:
-        """Encode with a frozen copy of this model from now on."""
-        if encoder is not None:
-            encoder = deepcopy(encoder).requires_grad_(False)
-        object.__setattr__(self, "encoder", encoder)  # not as a submodule
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SynergyDecoder:
-        if self.encoder is not None:  # moves to the same device and dtype
-            self.encoder._apply(fn, recurse)
-        return super()._apply(fn, recurse)
 
     @classmethod
     def from_gmvae(
@@ -262,7 +245,7 @@ class SynergyDecoder(SynergyMap):
 
     def log_slope(self, synergy: Tensor) -> Tensor:
         if not self.residual:
-            return synergy.new_zeros(synergy.shape[:-1])
+            return super().log_slope(synergy)
         return tanh_sum_log_slope(*self.module.summands(synergy)).sum(-1)
 
     @property
@@ -298,15 +281,8 @@ class SynergyDecoder(SynergyMap):
 
     @property
     def config(self) -> dict[str, Any]:
-        """JSON-able arguments: ``SynergyDecoder(**config)`` plus a state dict rebuilds it."""
-        return {
-            "num_synergies": self.num_synergies,
-            "action_dim": self.action_dim,
-            "low": self.low.tolist(),
-            "high": self.high.tolist(),
-            "hidden": list(self.module.decoder.hidden),
-            "residual": self.residual,
-        }
+        own = {"hidden": list(self.module.decoder.hidden), "residual": self.residual}
+        return super().config | own
 
     @property
     def low(self) -> Tensor:

@@ -23,7 +23,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_etl.checks import not_finite
 from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder, surviving_folder
-from torchrl_etl.modules import GMVAE, SynergyDecoder
+from torchrl_etl.modules import GMVAE, SynergyMap, describe_map, make_map
 from torchrl_etl.synergies.bundle_info import (
     COPY_AGAIN,
     DESCRIPTION,
@@ -35,6 +35,7 @@ from torchrl_etl.synergies.bundle_info import (
 
 __all__ = ["BUNDLE_FILES", "bundle_files", "copy_bundle", "load_bundle", "save_bundle"]
 
+_DEFAULT_MAP = "synergies"  # its descriptions have no kind, as there once was no other
 _ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
 BUNDLE_FILES = (_TENSORS, DESCRIPTION)
@@ -42,7 +43,7 @@ BUNDLE_FILES = (_TENSORS, DESCRIPTION)
 
 
 def save_bundle(
-    decoder: SynergyDecoder,
+    decoder: SynergyMap,
     path: str | os.PathLike[str],
     *,
     task: str,
@@ -59,7 +60,7 @@ def save_bundle(
     or the new one. Only one process at a time may save to a path.
 
     Args:
-        decoder (SynergyDecoder): the decoder.
+        decoder (SynergyMap): the decoder.
         path (path-like): the bundle's folder; parents are created.
 
     Keyword Args:
@@ -67,10 +68,11 @@ def save_bundle(
         actuators (sequence of str): names of the n actuators, in action order.
         facts (mapping, optional): JSON-serializable values; paths and torch or numpy scalars are
             converted, non-finite numbers become null.
-        kind (str, optional): kind of synergies. Default: ``"affine"`` for a decoder without hidden
-            layers, else ``"gmvae"``.
+        kind (str, optional): kind of synergies. Default: ``"gmvae"`` for a SynergyDecoder,
+            ``"affine"`` for one without hidden layers, else the kind of the map.
 
     Raises:
+        ValueError: if the decoder is not a :class:`~torchrl_etl.modules.SynergyMap`.
         BundleError: if task or kind is not a string, the names do not fit the decoder, a weight is
             not finite, a fact is not JSON-serializable, or ``path`` holds other files.
 
@@ -86,7 +88,10 @@ def save_bundle(
         >>> info.task, info.actuators, copy.num_synergies
         ('toy', ('a', 'b', 'c'), 2)
     """
-    kind = default_kind(decoder.is_affine) if kind is None else kind
+    config = _plain(describe_map(decoder), "config")
+    if config["kind"] == _DEFAULT_MAP:
+        del config["kind"]
+    kind = default_kind(config) if kind is None else kind
     for name, value in {"task": task, "kind": kind}.items():
         if not isinstance(value, str):
             raise BundleError(f"{name} is {value!r}; it must be a string.")
@@ -107,14 +112,13 @@ def save_bundle(
     tensors = safetensors.torch.save(
         {key: value.detach().cpu().clone() for key, value in state.items()}
     )
-    config = _plain(decoder.config, "config")
     info = BundleInfo(
         task=task,
         actuators=actuators,
         low=tuple(decoder.low.tolist()),
         high=tuple(decoder.high.tolist()),
         num_synergies=int(decoder.num_synergies),
-        residual=float(config.get("residual", 0.0)),
+        residual=float(decoder.residual),
         config=config,
         sha256=hashlib.sha256(tensors).hexdigest(),
         facts=_plain(dict(facts or {}), "facts"),
@@ -133,7 +137,7 @@ def load_bundle(
     residual: float | None = None,
     in_keys: Sequence[NestedKey] = ("synergy",),
     out_keys: Sequence[NestedKey] = ("action",),
-) -> tuple[SynergyDecoder, BundleInfo]:
+) -> tuple[SynergyMap, BundleInfo]:
     """Read a bundle from its folder, or from a run folder with a subfolder ``synergies/``.
 
     No code in a bundle is executed: tensors are read as safetensors only. The digest detects
@@ -144,10 +148,10 @@ def load_bundle(
 
     Keyword Args:
         residual (float, optional): replaces the bundle's residual share; it has no weights.
-        in_keys, out_keys (sequence of NestedKey): see :class:`SynergyDecoder`.
+        in_keys, out_keys (sequence of NestedKey): see :class:`~torchrl_etl.modules.SynergyDecoder`.
 
     Returns:
-        tuple of SynergyDecoder and BundleInfo: the decoder on the CPU, and its description.
+        tuple of SynergyMap and BundleInfo: the decoder on the CPU, and its description.
 
     Raises:
         BundleError: if there is no bundle, it is damaged, or it has another format version.
@@ -178,11 +182,11 @@ def load_bundle(
             f"{bad} of the decoder in {str(folder)!r} is not finite: its training diverged before "
             "it was saved; explore again, or take another bundle."
         )
-    config = dict(info.config) if residual is None else {**info.config, "residual": residual}
+    described = {"kind": _DEFAULT_MAP, **info.config}
     try:
         # Initial weights are overwritten at once, so drawing them must not advance the global RNG.
         with torch.random.fork_rng(devices=[]):
-            decoder = SynergyDecoder(**config, in_keys=in_keys, out_keys=out_keys)
+            decoder = make_map(described, residual=residual, in_keys=in_keys, out_keys=out_keys)
             encoder = None if info.encoder is None else GMVAE(**info.encoder)
         if encoder is not None:
             inner = {key for key in state if key.startswith(_ENCODER)}
@@ -190,7 +194,7 @@ def load_bundle(
         decoder.load_state_dict(state)
     except (TypeError, ValueError, RuntimeError) as error:
         raise BundleError(
-            f"The config and the tensors in {str(folder)!r} do not make a SynergyDecoder: {error}"
+            f"The config and the tensors in {str(folder)!r} do not make a decoder: {error}"
         ) from error
     decoder.set_encoder(encoder)
     bounds = tuple(decoder.low.tolist()), tuple(decoder.high.tolist())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
@@ -44,7 +44,7 @@ class BundleInfo:
         low, high (tuple of float): action bounds [n].
         num_synergies (int): number d of synergies.
         residual (float): residual share of the decoder.
-        config (dict): constructor arguments of the decoder.
+        config (dict): constructor arguments of the decoder; its ``kind`` unless a SynergyDecoder.
         sha256 (str): digest of the tensors file.
         facts (dict): frames, seed, commit, versions, variance accounted for, and so on.
         kind (str): kind of synergies, such as ``"gmvae"`` or ``"nmf"``.
@@ -102,13 +102,13 @@ def read_description(folder: Path) -> BundleInfo:
             )
     if not all(isinstance(name, str) for name in content["actuators"]):
         raise BundleError(f"{path} has actuators that are not strings; copy the bundle again.")
-    if content["residual"] != (own := content["config"].get("residual", 0.0)):
+    if content["residual"] != (own := content["config"].get("residual", content["residual"])):
         raise BundleError(
             f"{path} states a residual of {content['residual']!r} for a decoder with {own!r}; it "
             "was edited, so copy the bundle again."
         )
     if version == 1:
-        content["kind"] = default_kind(not content["config"].get("hidden", True))
+        content["kind"] = default_kind(content["config"])
     if not isinstance(content["kind"], str) or not isinstance(content["encoder"], dict | None):
         raise BundleError(
             f"{path} has kind {content['kind']!r}, which must be a string, and encoder "
@@ -163,9 +163,9 @@ def check_compatible(
             )
 
 
-def default_kind(is_affine: bool) -> str:
-    """The kind of a decoder for which none is recorded."""
-    return "affine" if is_affine else "gmvae"
+def default_kind(config: Mapping[str, Any]) -> str:
+    """The kind of synergies for which none is recorded, by the map's arguments."""
+    return config.get("kind") or ("gmvae" if config.get("hidden", True) else "affine")
 
 
 def _explain_names(info: BundleInfo, actuators: tuple[str, ...]) -> str:

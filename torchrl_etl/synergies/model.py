@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import save_bundle
 
 __all__ = ["SynergyModel"]
@@ -46,7 +46,7 @@ class SynergyModel(ABC):
         """
 
     @abstractmethod
-    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyDecoder:
+    def decoder(self, actions: Tensor, *, residual: float = 0.0) -> SynergyMap:
         """The map from coefficients in [-1, 1]^d to actions, scaled to span ``actions`` [N, n]."""
 
     @abstractmethod

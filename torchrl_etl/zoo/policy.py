@@ -17,7 +17,7 @@ from torchrl.data import Bounded
 from torchrl_etl.baselines import make_dynsyn_actor, make_lattice_actor
 from torchrl_etl.checks import check_choice
 from torchrl_etl.learners import NORMALIZED, from_observation
-from torchrl_etl.modules import RunningNorm, SARDecoder, SynergyDecoder, SynergyMap, make_actor
+from torchrl_etl.modules import RunningNorm, SynergyMap, describe_map, make_actor, make_map
 
 __all__ = ["ACTORS", "describe_decoder", "make_policy"]
 
@@ -65,7 +65,7 @@ def make_policy(
     with torch.random.fork_rng(devices=[]):
         emitted, out_key, map_ = _spec(low, high), "action", None
         if decoder is not None:
-            map_ = _make_decoder(decoder, low, high)
+            map_ = make_map({**decoder, "action_dim": len(low), "low": low, "high": high})
             emitted, out_key = map_.synergy_spec, map_.in_keys[0]
         norm = RunningNorm(observation_dim) if normalize_observations else None
         inputs = {"observation" if norm is None else NORMALIZED: observation_dim}
@@ -81,35 +81,22 @@ def make_policy(
 def describe_decoder(decoder: SynergyMap | None) -> dict[str, Any] | None:
     """The ``decoder`` argument of :func:`make_policy` for a decoder.
 
+    It leaves out what the card has already: the action's size and bounds.
+
     Raises:
-        ValueError: for a decoder other than ETL's or SAR's.
+        ValueError: if it is not a :class:`~torchrl_etl.modules.SynergyMap`.
 
     Examples:
+        >>> from torchrl_etl.modules import SynergyDecoder
         >>> describe_decoder(SynergyDecoder(2, 3, hidden=[8]))
         {'kind': 'synergies', 'num_synergies': 2, 'hidden': [8], 'residual': 0.0}
     """
     if decoder is None:
         return None
-    if type(decoder) is SynergyDecoder:
-        config = decoder.config
-        kept = {key: config[key] for key in ("num_synergies", "hidden", "residual")}
-        return {"kind": "synergies", **kept}
-    if type(decoder) is SARDecoder:
-        return {"kind": "sar", "num_synergies": decoder.num_synergies, "blend": decoder.blend}
-    raise ValueError(
-        f"The policy decodes with a {type(decoder).__name__}, which zoo entries do not support; "
-        "export runs that use SynergyDecoder or SARDecoder."
-    )
+    described = describe_map(decoder)
+    return {key: described[key] for key in described if key not in ("action_dim", "low", "high")}
 
 
 def _spec(low: list[float], high: list[float]) -> Bounded:
     bounds = torch.tensor(low), torch.tensor(high)
     return Bounded(*bounds, shape=bounds[0].shape, dtype=torch.float32)
-
-
-def _make_decoder(described: Mapping[str, Any], low: list[float], high: list[float]) -> SynergyMap:
-    options = dict(described)
-    check_choice("kind", kind := options.pop("kind", None), ("synergies", "sar"))
-    number = options.pop("num_synergies")
-    of_kind = SynergyDecoder if kind == "synergies" else SARDecoder
-    return of_kind(number, len(low), low=low, high=high, **options)
