@@ -19,7 +19,6 @@ from torchrl_etl.baselines.dynsyn import (
     GroupedTanhNormal,
     MuscleGroups,
     make_dynsyn_actor,
-    set_frames,
 )
 from torchrl_etl.collectors.policy_on_arrays import PolicyOnArrays
 from torchrl_etl.modules import make_critic
@@ -188,7 +187,7 @@ def observations(*rows: int) -> TensorDict:
 )
 def test_amplitude_schedule_by_hand(frames: int, amplitude: float) -> None:
     actor = actor_on()
-    set_frames(actor, frames)
+    actor[0].module.advance(frames)
     written = actor(observations(2))["amplitude"]
     torch.testing.assert_close(written, torch.full((2, 1), amplitude))
 
@@ -196,13 +195,13 @@ def test_amplitude_schedule_by_hand(frames: int, amplitude: float) -> None:
 def test_amplitude_schedule_is_configurable() -> None:
     actor = actor_on(slope=1e-4, start=100, ceiling=0.02)
     for frames, amplitude in ((100, 0.0), (200, 0.01), (1000, 0.02)):
-        set_frames(actor, frames)
+        actor[0].module.advance(frames)
         torch.testing.assert_close(actor[0].module.amplitude.item(), amplitude)
 
 
 def test_state_dict_carries_the_amplitude() -> None:
     one, other = actor_on(), actor_on()
-    set_frames(one, 2_000_000)
+    one[0].module.advance(2_000_000)
     other.load_state_dict(one.state_dict())
     assert other[0].module.amplitude.item() == pytest.approx(0.05)
     data = observations(3)
@@ -214,7 +213,7 @@ def test_loss_sees_frames_set_on_the_actor() -> None:
     actor = actor_on()
     critic = make_critic({"observation": 4, "action": 6}, hidden=(8,))
     loss = LeanSACLoss(actor, critic, target_entropy=-3.0)
-    set_frames(actor, 3_000_000)
+    actor[0].module.advance(3_000_000)
     action, _ = loss._sample(observations(50))
     middle, half = (LOW + HIGH) / 2, (HIGH - LOW) / 2
     weights = weights_of((action - middle) / half)
@@ -223,7 +222,7 @@ def test_loss_sees_frames_set_on_the_actor() -> None:
 
 def test_gradients_reach_scales_and_deviations() -> None:
     actor = actor_on()
-    set_frames(actor, 3_000_000)
+    actor[0].module.advance(3_000_000)
     head = actor[0].module.layers[-1]
     action, log_prob = compute_rsample_log_prob(actor.get_dist(observations(64)))
     by_action, by_score = (
@@ -265,7 +264,7 @@ def test_policy_on_arrays_matches_the_actor() -> None:
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         on_arrays = PolicyOnArrays(actor)
         for frames in (0, 3_000_000):  # the traced graph reads the buffer at each call
-            set_frames(actor, frames)
+            actor[0].module.advance(frames)
             action = on_arrays({"observation": data["observation"].numpy()})["action"]
             expected = actor(data.clone())["action"]
             torch.testing.assert_close(torch.from_numpy(action), expected)
@@ -273,7 +272,7 @@ def test_policy_on_arrays_matches_the_actor() -> None:
 
 def trained_actor(inputs: Any, spec: Bounded, **options: Any) -> Any:
     actor = make_dynsyn_actor(inputs, spec, [0, 1, 0, 1, 1], **options)
-    set_frames(actor, 2_000_000)
+    actor[0].module.advance(2_000_000)
     return actor
 
 

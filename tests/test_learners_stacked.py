@@ -10,7 +10,7 @@ from torchrl.envs.transforms import Transform
 
 from tests.configs import RESIDUAL
 from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
-from torchrl_etl.baselines import make_dynsyn_actor, set_frames
+from torchrl_etl.baselines import make_dynsyn_actor
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.learners import SACLearner, StackedLearners
 from torchrl_etl.learners.adam import GradientAdam
@@ -89,7 +89,7 @@ def test_stacked_dynsyn_learners_keep_their_muscle_groups():
     learners, batches = [], []
     for groups in ([0, 1, 0, 1], [0, 0, 1, 1]):
         actor = make_dynsyn_actor({"observation": 3}, spec, groups, hidden=(8,), slope=1.0, start=0)
-        set_frames(actor, 1)
+        actor[0].module.advance(1)
         critic = make_critic({"observation": 3, "action": 4}, hidden=(8,))
         learners.append(SACLearner(actor, critic, action_spec=spec))
         end = torch.zeros(32, 1, dtype=torch.bool)

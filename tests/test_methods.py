@@ -14,7 +14,7 @@ from tests.configs import CONF, ELBOW, rival, tiny
 from tests.runs import numbers
 from tests.stages import fill, method_stage
 from torchrl_etl.baselines import DEPExploration
-from torchrl_etl.baselines.dynsyn import DynSynNetwork, set_frames
+from torchrl_etl.baselines.dynsyn import DynSynNetwork
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners.compiled import compiled
@@ -332,7 +332,7 @@ def test_dynsyn_amplitude_schedule_scales_with_the_budget(tmp_path):
     assert stage.budget == 408  # 608 less the recording; the schedule starts at a third, 136
     for frames, amplitude in ((0, 0.0), (136, 0.0), (272, 0.05), (408, 0.1)):
         stage.progress.frames = frames
-        set_frames(stage.learner.actor, frames)
+        network.advance(frames)
         assert network.amplitude.item() == pytest.approx(amplitude, abs=1e-4)
     stage.close()
 
@@ -349,7 +349,7 @@ def test_dynsyn_evaluates_with_the_amplitude_of_the_last_batch(tmp_path):
 def test_dynsyn_paper_preset_has_the_published_amplitude(tmp_path):
     made = tiny("method=dynsyn_paper", ELBOW, f"run_dir='{tmp_path}/run'", "learn.frames=3000000")
     network = Experiment(made).method.stage().learner.actor[0].module
-    set_frames(network, 2_000_000)
+    network.advance(2_000_000)
     assert network.amplitude.item() == pytest.approx(0.05)
 
 

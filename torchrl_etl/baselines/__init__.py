@@ -2,7 +2,7 @@
 
 from torchrl_etl.baselines.best_episodes import best_episodes
 from torchrl_etl.baselines.dep import DEPController, DEPExploration
-from torchrl_etl.baselines.dynsyn import GroupedTanhNormal, make_dynsyn_actor, set_frames
+from torchrl_etl.baselines.dynsyn import GroupedTanhNormal, make_dynsyn_actor
 from torchrl_etl.baselines.eme import EMELoss
 from torchrl_etl.baselines.eme_bonus import EMEBonus
 from torchrl_etl.baselines.lattice import LatticeNormal, make_lattice_actor
@@ -24,5 +24,4 @@ __all__ = [
     "make_dynsyn_actor",
     "make_lattice_actor",
     "record_muscle_lengths",
-    "set_frames",
 ]

@@ -13,6 +13,7 @@ from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
+from torchrl_etl.modules.scheduled import Scheduled
 
 __all__ = ["DEPController", "DEPExploration"]
 
@@ -148,7 +149,7 @@ class DEPController:
         return self.kappa * matrix / (length if self.normalize == "rows" else length.mT)
 
 
-class DEPExploration(TensorDictModuleBase):
+class DEPExploration(TensorDictModuleBase, Scheduled):
     r"""Replaces some of a policy's actions by those of a :class:`DEPController`.
 
     Put it after the actor: ``TensorDictSequential(actor, DEPExploration(action_spec))``. DEP acts
@@ -212,7 +213,7 @@ class DEPExploration(TensorDictModuleBase):
     """
 
     frames: int
-    """Frames seen so far. Set it to resume a run."""
+    """Frames seen so far; :meth:`restart` sets it."""
 
     def __init__(
         self,
@@ -252,6 +253,9 @@ class DEPExploration(TensorDictModuleBase):
         self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
         self.frames, self._settings = 0, controller
         self._start(torch.empty(0, action_spec.shape[0]))
+
+    def restart(self, actions: int) -> None:
+        self.frames = actions
 
     def _start(self, lengths: Tensor) -> None:
         # Not buffers: a collector's weight update would overwrite them with the learner's.

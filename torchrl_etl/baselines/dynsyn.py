@@ -16,9 +16,10 @@ from torchrl.modules import NormalParamExtractor, ProbabilisticActor, TanhNormal
 from torchrl_etl.checks import check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers, start_small
+from torchrl_etl.modules.scheduled import Scheduled
 from torchrl_etl.objectives.sac import rsample_and_log_prob
 
-__all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor", "set_frames"]
+__all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_actor"]
 
 # Weights of members stay within 10 % of 1, even before the amplitude limits them.
 _DEVIATION = 0.1
@@ -169,7 +170,7 @@ def gather_last(values: Tensor, index: Tensor) -> Tensor:
     return values.expand(*shape, -1).gather(-1, index.expand(*shape, -1))
 
 
-class DynSynNetwork(nn.Module):
+class DynSynNetwork(nn.Module, Scheduled):
     """Network of a DynSyn actor: outputs the parameters of :class:`GroupedTanhNormal`.
 
     They include the groups, which may differ between actors that are updated side by side. The
@@ -196,6 +197,9 @@ class DynSynNetwork(nn.Module):
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         for name, index in groups._asdict().items():
             self.register_buffer(name, index, persistent=False)
+
+    def advance(self, frames: int) -> None:
+        self.frames.fill_(frames)
 
     @property
     def amplitude(self) -> Tensor:
@@ -227,8 +231,8 @@ def make_dynsyn_actor(
 ) -> ProbabilisticActor:
     """Actor that moves muscles in groups and later learns deviations of their members.
 
-    At first the members of a group get the same action. Once :func:`set_frames` passes ``start``,
-    their weights may deviate; with the defaults, by up to 10 % at 3,000,000 frames.
+    At first the members of a group get the same action. Once :meth:`DynSynNetwork.advance` passes
+    ``start``, their weights may deviate; with the defaults, by up to 10 % at 3,000,000 frames.
 
     Its log-probability covers k dimensions, so SAC's target entropy should too.
 
@@ -263,7 +267,7 @@ def make_dynsyn_actor(
         >>> action = actor(TensorDict({"observation": torch.randn(3, 7)}, [3]))["action"]
         >>> torch.equal(action[:, 0], action[:, 3])
         True
-        >>> set_frames(actor, 2_000_000)
+        >>> actor[0].module.advance(2_000_000)
         >>> actor[0].module.amplitude
         tensor(0.0500)
     """
@@ -281,25 +285,3 @@ def make_dynsyn_actor(
     network = DynSynNetwork(layers, groups, slope=slope, start=start, ceiling=ceiling)
     parameters = ["loc", "scale", "weight_loc", "amplitude", *MuscleGroups._fields]
     return actor_with(GroupedTanhNormal, network, inputs, parameters, action_spec, out_key)
-
-
-def set_frames(actor: nn.Module, frames: int) -> None:
-    """Set the number of frames collected so far in the DynSyn actors of a module.
-
-    Raises:
-        ValueError: if there is no such actor.
-
-    Examples:
-        >>> set_frames(nn.Linear(2, 2), 10)
-        Traceback (most recent call last):
-        ...
-        ValueError: There is no DynSyn actor in this Linear; make one with make_dynsyn_actor.
-    """
-    networks = [module for module in actor.modules() if isinstance(module, DynSynNetwork)]
-    if not networks:
-        raise ValueError(
-            f"There is no DynSyn actor in this {type(actor).__name__}; make one with "
-            "make_dynsyn_actor."
-        )
-    for network in networks:
-        network.frames.fill_(frames)

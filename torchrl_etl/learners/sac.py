@@ -32,7 +32,7 @@ from torchrl_etl.learners.parts import (
     make_return_scale,
 )
 from torchrl_etl.learners.term import Term
-from torchrl_etl.modules import RunningNorm, SynergyMap
+from torchrl_etl.modules import RunningNorm, Scheduled, SynergyMap
 from torchrl_etl.objectives import FusedSoftUpdate
 
 __all__ = ["Gradients", "SACLearner"]
@@ -55,7 +55,8 @@ class SACLearner:
         decoder (SynergyMap, optional): maps the actor's output to actions.
         train_decoder (bool): train the decoder on the actor loss. Default: ``False``.
         behavior (TensorDictModuleBase, optional): policy that collects, such as the actor with
-            exploration noise. Default: the actor.
+            exploration noise. Its :class:`~torchrl_etl.modules.Scheduled` modules are told how far
+            the run is. Default: the actor.
         terms (sequence of Term): losses to minimize besides SAC's. Default: none.
         transforms (sequence of Transform): applied to each batch at its update, when they see the
             current networks; an intrinsic bonus, for example. The attribute ``networks`` of a
@@ -76,9 +77,6 @@ class SACLearner:
         loss_function (str): loss of scalar critics. Default: ``"l2"``.
         return_bound (float, optional): scale rewards so that returns stay within ± this bound.
         bins (int): above 1, critics are categorical with ``bins`` atoms in ±``return_bound``.
-        on_frames (sequence of callable): called with the frame count after each batch.
-        on_restart (sequence of callable): called when new episodes begin, with the number of
-            actions that each worker has taken, so that counters in ``behavior`` can resume.
         compile (bool): compile updates; on CUDA, also capture each as one CUDA graph.
 
     Raises:
@@ -122,8 +120,6 @@ class SACLearner:
         loss_function: str = "l2",
         return_bound: float | None = None,
         bins: int = 1,
-        on_frames: Sequence[Callable[[int], None]] = (),
-        on_restart: Sequence[Callable[[int], None]] = (),
         compile: bool = False,
     ) -> None:
         check_real("(0, inf)", lr=lr)
@@ -132,7 +128,6 @@ class SACLearner:
         check_real("[0, 1)", ema_decay=ema_decay)
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
         self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
-        self.on_frames, self.on_restart = on_frames, on_restart
         scale = make_return_scale(gamma, return_bound)
         sac = make_loss(
             actor,
@@ -158,6 +153,7 @@ class SACLearner:
         self.ema = WarmedUpEMA(actor, ema_decay)
         acting = actor if behavior is None else behavior
         self.behavior = from_observation(acting, normalizer, decoder)
+        self.scheduled = [each for each in acting.modules() if isinstance(each, Scheduled)]
         self.policy = from_observation(self.ema.module, normalizer, decoder)
         self.optimizer = make_optimizer(parameter_groups(sac, terms, lr), self.device)
         self.parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
@@ -237,14 +233,14 @@ class SACLearner:
         """Prepare for new episodes in all simulators, after ``actions`` actions of each worker."""
         if self.objective.return_scale is not None:
             self.objective.return_scale.reset_episodes()
-        for tell in self.on_restart:
-            tell(actions)
+        for module in self.scheduled:
+            module.restart(actions)
 
     def advance(self, frames: int, progress: float) -> None:
-        """Set learning rates by ``progress``, the share of frames collected; call ``on_frames``."""
+        """Set learning rates and schedules after a batch; ``progress`` is frames over budget."""
         self.optimizer.scale_rates(1.0 - (1.0 - self.lr_end) * min(1.0, progress))
-        for tell in self.on_frames:
-            tell(frames)
+        for module in self.scheduled:
+            module.advance(frames)
 
     @property
     def num_updates(self) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.baselines import DEPExploration
@@ -38,8 +36,7 @@ class DEP(Method):
         controller.dep_frames = self.context.actions(self.options["dep_frames"])
         actor = self.context.actor()
         behavior = TensorDictSequential(self.context.behavior(actor), controller)
-        counter = partial(setattr, controller, "frames")
-        learner = self.context.learner(actor, behavior=behavior, on_restart=[counter])
+        learner = self.context.learner(actor, behavior=behavior)
         return self.context.stage(learner, env_options={"muscle_lengths": True})
 
     def check(self) -> None:

@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchrl_etl.baselines import (
-    group_muscles,
-    make_dynsyn_actor,
-    record_muscle_lengths,
-    set_frames,
-)
+from torchrl_etl.baselines import group_muscles, make_dynsyn_actor, record_muscle_lengths
 from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.io import read_json, write_atomically
 from torchrl_etl.methods.method import Method
@@ -97,7 +91,4 @@ class DynSyn(Method):
         actor = self.context.actor(make=make_dynsyn_actor, groups=groups, **deviation)
         # The actor's log-probability has one dimension per group.
         first = [groups.index(group) for group in sorted(set(groups))]
-        learner = self.context.learner(
-            actor, entropy_spec=spec[first], on_frames=[partial(set_frames, actor)]
-        )
-        return self.context.stage(learner)
+        return self.context.stage(self.context.learner(actor, entropy_spec=spec[first]))

@@ -8,6 +8,7 @@ from torchrl_etl.modules.policy_function import policy_function
 from torchrl_etl.modules.return_scale import ReturnScale
 from torchrl_etl.modules.running_norm import RunningNorm
 from torchrl_etl.modules.sar_decoder import SARDecoder
+from torchrl_etl.modules.scheduled import Scheduled
 from torchrl_etl.modules.state_encoder import GaussianDynamics, StateEncoder
 from torchrl_etl.modules.synergy_decoder import SynergyDecoder
 from torchrl_etl.modules.synergy_map import SynergyMap
@@ -23,6 +24,7 @@ __all__ = [
     "ReturnScale",
     "RunningNorm",
     "SARDecoder",
+    "Scheduled",
     "StateEncoder",
     "SynergyDecoder",
     "SynergyMap",

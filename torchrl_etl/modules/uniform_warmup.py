@@ -11,11 +11,12 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.checks import check_integer
 from torchrl_etl.modules.recorded_actions import bounds_of
+from torchrl_etl.modules.scheduled import Scheduled
 
 __all__ = ["UniformWarmup"]
 
 
-class UniformWarmup(TensorDictModuleBase):
+class UniformWarmup(TensorDictModuleBase, Scheduled):
     """Replaces a policy's first ``frames`` actions by uniform ones.
 
     Put it after the actor: ``TensorDictSequential(actor, UniformWarmup(action_spec, 10_000))``.
@@ -52,7 +53,7 @@ class UniformWarmup(TensorDictModuleBase):
     """
 
     seen: int
-    """Actions counted so far. Set it to resume a run."""
+    """Actions counted so far; :meth:`restart` sets it."""
 
     def __init__(
         self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"
@@ -65,6 +66,9 @@ class UniformWarmup(TensorDictModuleBase):
         self.in_keys = self.out_keys = [self.action_key]
         self.register_buffer("low", low.clone(), persistent=False)
         self.register_buffer("high", high.clone(), persistent=False)
+
+    def restart(self, actions: int) -> None:
+        self.seen = actions
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -172,7 +172,6 @@ class Context:
         if uniform := self._uniform_actions(section):
             warmup = UniformWarmup(output, uniform, action_key=out_key)
             behavior = TensorDictSequential(behavior, warmup)
-            parts["on_restart"] = [*parts.get("on_restart", ()), partial(setattr, warmup, "seen")]
         sizes = self._inputs(section, spec, inputs)
         with naming(f"{section}.critic"):
             critic = make_critic({**sizes, "action": spec.action_dim}, **options["critic"])
