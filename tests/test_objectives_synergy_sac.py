@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.modules import ValueOperator
 
 from tests.loss_checks import SEED, LossChecks
-from torchrl_etl.modules import SynergyDecoder, make_actor, make_critic
+from torchrl_etl.modules import SynergyDecoder, SynergyMap, make_actor, make_critic
 from torchrl_etl.objectives import SynergySACLoss
 
 OBSERVATION, SYNERGIES, ACTION, GAMMA = 3, 2, 5, 0.9
@@ -159,11 +159,12 @@ def test_decoder_that_does_not_connect_actor_and_critic_is_refused(
 def test_invalid_decoders_and_value_networks_are_refused() -> None:
     loss = make_loss()
     actor, critic = loss.actor_network, loss.qvalue_network
-    two = TensorDictModule(lambda x, y: x, in_keys=["synergy", "observation"], out_keys=["action"])
+    two = SynergyMap(lambda x, y: x, in_keys=["synergy", "observation"], out_keys=["action"])
     with pytest.raises(ValueError, match="The decoder maps"):
         SynergySACLoss(actor, critic, two)
-    with pytest.raises(TypeError, match="decoder is a Linear"):
-        SynergySACLoss(actor, critic, nn.Linear(2, 5))
+    plain = TensorDictModule(nn.Linear(2, 5), in_keys=["synergy"], out_keys=["action"])
+    with pytest.raises(TypeError, match="decoder is a TensorDictModule; pass a SynergyMap"):
+        SynergySACLoss(actor, critic, plain)
     value = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     with pytest.raises(TypeError, match="value_network is given"):
         SynergySACLoss(actor, critic, loss.decoder_network, value_network=value)

@@ -17,6 +17,7 @@ from torchrl.objectives import SoftUpdate
 
 from tests.loss_checks import SEED
 from tests.test_objectives_synergy_sac import ACTION, GAMMA, SYNERGIES, make_data, make_loss
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.objectives import SynergySACLoss
 
 # The expected losses, composed by hand from the networks.
@@ -208,7 +209,7 @@ def test_actor_loss_by_hand() -> None:
     actor.register_module("weights", fixed)  # a lambda hides them
     network = nn.Linear(1, 2, bias=False)
     network.weight.data = torch.tensor([[1.0], [2.0]])
-    decoder = TensorDictModule(network, in_keys=["u"], out_keys=["muscles"])
+    decoder = SynergyMap(network, in_keys=["u"], out_keys=["muscles"])
 
     class Linear(nn.Module):
         def __init__(self) -> None:

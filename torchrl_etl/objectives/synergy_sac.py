@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.objectives import SACLoss
 
+from torchrl_etl.modules import SynergyMap
 from torchrl_etl.objectives.checks import check_parts, warn_of_previous_action
 from torchrl_etl.objectives.sac import LeanSACLoss, call
 
@@ -26,7 +27,7 @@ class SynergySACLoss(LeanSACLoss):
     the decoder changes, and the actor loss can train the decoder on the task's reward.
 
     Entropy is measured over the coefficients and the action given them: the decoder's
-    :meth:`~torchrl_etl.modules.SynergyDecoder.log_slope` corrects for how far the action moves with
+    :meth:`~torchrl_etl.modules.SynergyMap.log_slope` corrects for how far the action moves with
     the residual. Otherwise noise that the action's bounds suppress would count. If the residual's
     noise has a fixed size, set ``entropy_dims``: only the coefficients' entropy counts then,
     without the correction. The policy could change the rest only by keeping muscles off their
@@ -40,7 +41,7 @@ class SynergySACLoss(LeanSACLoss):
     Args:
         actor_network (ProbabilisticTensorDictSequential): writes the coefficients.
         qvalue_network (TensorDictModule): reads the observation and the decoded action.
-        decoder (TensorDictModule): reads the actor's sample, writes the critics' action.
+        decoder (SynergyMap): reads the actor's sample, writes the critics' action.
 
     Keyword Args:
         train_decoder (bool): let ``loss_actor`` reach the decoder. Default: ``True``.
@@ -53,7 +54,7 @@ class SynergySACLoss(LeanSACLoss):
         its input.
 
     Raises:
-        TypeError: if the decoder is not a TensorDict module, or a ``value_network`` is given.
+        TypeError: if the decoder is not a SynergyMap, or a ``value_network`` is given.
         ValueError: if the decoder does not map the actor's sample to the critics' action, or the
             critics read the sample itself; for an unknown reduction.
 
@@ -100,7 +101,7 @@ class SynergySACLoss(LeanSACLoss):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
 
-    decoder_network: TensorDictModule
+    decoder_network: SynergyMap
     decoder_network_params: TensorDictParams
     target_decoder_network_params: TensorDictParams
 
@@ -108,12 +109,12 @@ class SynergySACLoss(LeanSACLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule,
-        decoder: TensorDictModule,
+        decoder: SynergyMap,
         *,
         train_decoder: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_parts("decoder", decoder, TensorDictModule, outputs=1)
+        check_parts("decoder", decoder, SynergyMap, outputs=1)
         sampled, decoded = list(actor_network.dist_sample_keys), list(decoder.out_keys)
         if (
             list(decoder.in_keys) != sampled
@@ -126,9 +127,9 @@ class SynergySACLoss(LeanSACLoss):
                 "input must be the actor's sample and its one output the critic's action."
             )
         warn_of_previous_action(f"The critic of {type(self).__name__}", decoded)
-        self.decoded_key: NestedKey = decoded[0]
-        self.train_decoder = train_decoder
+        self.decoded_key: NestedKey = decoded[0]  # first: SACLoss collects its in-keys when built
         super().__init__(actor_network, qvalue_network, **kwargs)
+        self.train_decoder = train_decoder
         self.convert_to_functional(decoder, "decoder_network", create_target_params=False)
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
@@ -156,7 +157,7 @@ class SynergySACLoss(LeanSACLoss):
 
     def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         synergy, log_prob = super()._sample(tensordict)
-        if self.entropy_dims is not None or not hasattr(self.decoder_network, "log_slope"):
+        if self.entropy_dims is not None:
             return synergy, log_prob
         params = self.decoder_network_params
         params = params if self.train_decoder else params.detach()
