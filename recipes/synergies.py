@@ -107,11 +107,9 @@ def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
     check_integer(0, seed=config.seed)
     check_real("[0, 1]", vaf=config.vaf)
     check_real("(-inf, inf)", low=config.low, high=config.high)
-    options = OmegaConf.to_container(config.synergies, resolve=True)
+    options = {"updates": config.updates, **OmegaConf.to_container(config.synergies, resolve=True)}
     kind = options.pop("kind")
     options.pop("bundle")
-    if kind in ("gmvae", "vae"):
-        options["updates"] = config.updates
     return kind, options
 
 
@@ -194,8 +192,9 @@ def write_results(
     rows.writerows((number, *found[number]) for number in found)
     folder.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "vaf.csv", text.getvalue())
-    decoder = model.decoder(recording.activity)
-    rows_again = decoder(decoder.encode(recording.activity))
+    activity = torch.as_tensor(recording.activity, dtype=torch.float32)
+    decoder = model.decoder(activity)
+    rows_again = decoder(decoder.encode(activity))
     decoded = variance_accounted_for(recording.activity, rows_again.detach())
     save_bundle(
         decoder,

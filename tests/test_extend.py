@@ -198,6 +198,16 @@ def test_random_synergies_fit_recordings_worse_than_nmf(page_files, capsys):
     assert nmf > 0.99 > at_random > 0
 
 
+def test_synergies_recipe_sets_the_updates_of_a_users_model(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Learned, "fit", lambda self, actions: seen.append(self.updates))
+    seen = []
+    np.save("emg.npy", np.random.default_rng(0).random((40, 4)))
+    own = ("kind=pca", "synergies.kind=tests.test_extend:Learned", "num=2", "updates=7")
+    assert command("synergies.py", "data=emg.npy", *own, "out=found") == 0
+    assert set(seen) == {7}
+
+
 def test_synergies_recipe_accepts_the_random_kind(page_files, capsys):
     np.save("emg.npy", np.random.default_rng(0).random((40, 4)))
     assert command("synergies.py", "data=emg.npy", "kind=random", "num=2", "out=found") == 0

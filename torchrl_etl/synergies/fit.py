@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from torchrl_etl.checks import check_integer
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.synergies.gmvae import GMVAESynergies
 from torchrl_etl.synergies.model import SynergyModel
@@ -33,6 +34,7 @@ def fit_synergies(
     *,
     low: float | Sequence[float] | Tensor = -1.0,
     high: float | Sequence[float] | Tensor = 1.0,
+    updates: int | None = None,
     **options: Any,
 ) -> SynergyModel:
     """Find synergies in an array of actions, EMG or muscle activations [N, n].
@@ -47,6 +49,7 @@ def fit_synergies(
     Keyword Args:
         low, high (float, sequence of float or Tensor): bounds, scalar or [n]; 0 and 1 for
             normalized EMG. Default: -1 and 1.
+        updates (int, optional): training updates, for a kind that trains. Default: the model's own.
         **options: keyword arguments of the model's class.
 
     Returns:
@@ -76,5 +79,8 @@ def fit_synergies(
     low, high = as_bounds(low, high, width)
     found = as_actions(actions, low=low, high=high, min_rows=2)
     model = kind(low, high, num_synergies, **options)
+    if updates is not None:
+        check_integer(1, updates=updates)
+        model.updates = updates
     model.fit(found)
     return model

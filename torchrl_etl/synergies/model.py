@@ -28,7 +28,8 @@ class SynergyModel(ABC):
         loss (LossModule, optional): trained during stage 1 on the entry ``action``; ``None`` for a
             model that is fitted once, on all actions.
         lr (float): learning rate of the loss.
-        updates (int): updates in :meth:`fit`, if it trains; the VAF figure overrides it.
+        updates (int): updates in :meth:`fit`, if it trains; ``fit_synergies`` and the VAF figure
+            override it.
     """
 
     kind: ClassVar[str]
