@@ -25,6 +25,7 @@ from torchrl_etl.collectors.remote import (
     check_arguments,
     cpu_copy,
     seeded_env,
+    worker_options,
     worker_seed,
 )
 from torchrl_etl.collectors.worker_process import exit_with_learner
@@ -82,25 +83,15 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         collector_kwargs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        collector_kwargs = {"auto_register_policy_transforms": False, **(collector_kwargs or {})}
-        check_arguments(
-            create_env_fn,
-            policy,
-            num_workers=num_workers,
-            frames_per_batch=frames_per_batch,
-            sync=sync,
-            timeout=timeout,
-            collector_class=collector_class,
-            collector_kwargs=collector_kwargs,
-        )
+        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout)
+        collector_kwargs = worker_options(collector_class, collector_kwargs)
         _check_launcher(launcher)
         share = frames_per_batch // num_workers if sync else frames_per_batch
         work = {"frames_per_batch": share, "collector_class": collector_class}
         own_policy = cpu_copy(policy)
+        # TorchRL's constructor calls _make_container, which copies this.
         self._example = _one_batch(create_env_fn, own_policy, **work, **collector_kwargs)
-        self.launcher, self.timeout = launcher, timeout
-        self._trackers, self._asked = {}, {}
-        with self._starting(seed):
+        with self._starting(seed, timeout):
             super().__init__(
                 [create_env_fn] * num_workers,
                 own_policy,
@@ -114,16 +105,17 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             )
         self.policy, self.frames_per_batch = policy, frames_per_batch
         self._prepare(policy, sync, total_frames, timeout)
+        self._trackers, self._asked = {}, {}
         self._known = dict.fromkeys(range(num_workers), 0)  # TorchRL has already sent the weights
 
     # Workers ---------------------------------------------------------------------------------
 
     @contextmanager
-    def _starting(self, seed: int) -> Iterator[None]:
+    def _starting(self, seed: int, timeout: float) -> Iterator[None]:
         """Around TorchRL's constructor: seed workers, set timeouts, shut down after a failure."""
         # TorchRL 0.14.1 reads its timeout for the process group, 1000, as days. Its set_seed ends
         # the workers, so their main function has to seed them.
-        days, main = self.timeout / 86_400, partial(_seeded_main, seed)
+        days, main = timeout / 86_400, partial(_seeded_main, seed)
         mended = {"MAX_TIME_TO_CONNECT": days, "_distributed_init_collection_node": main}
         self.jobs, self._weight_sync_schemes = [], None
         try:
@@ -136,11 +128,11 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
                 raise
             who = f"worker {dead[0]} ended while it started" if dead else "workers did not start"
             raise RuntimeError(
-                f"DistributedWorkers: {who} (limit {self.timeout:g} s; its own message is in its "
+                f"DistributedWorkers: {who} (limit {timeout:g} s; its own message is in its "
                 f"output). {error}"
             ) from error
         for store in (self._store, self._weight_sync_schemes["policy"]._store):
-            store.set_timeout(timedelta(seconds=self.timeout))  # workers' stores wait longer
+            store.set_timeout(timedelta(seconds=timeout))  # workers' stores wait longer
 
     def _make_container(self) -> None:
         self._tensordict_out = [self._example.clone().lock_() for _ in range(self.num_workers)]

@@ -22,6 +22,7 @@ from torchrl_etl.collectors.remote import (
     check_arguments,
     cpu_copy,
     seeded_env,
+    worker_options,
     worker_seed,
 )
 
@@ -87,21 +88,13 @@ class RayWorkers(RemoteWorkers, RayCollector):
         remote_configs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        collector_kwargs = {"auto_register_policy_transforms": False, **(collector_kwargs or {})}
-        remote_configs = {"num_cpus": 1, **(remote_configs or {})}
-        check_arguments(
-            create_env_fn,
-            policy,
-            num_workers=num_workers,
-            frames_per_batch=frames_per_batch,
-            sync=sync,
-            timeout=timeout,
-            collector_class=collector_class,
-            collector_kwargs=collector_kwargs,
-        )
+        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout)
+        collector_kwargs = worker_options(collector_class, collector_kwargs)
         check_integer(0, replacements=replacements)
+        remote_configs = {"num_cpus": 1, **(remote_configs or {})}
+        # TorchRL's constructor calls add_collectors, which starts workers with these, and shutdown
+        # if that fails.
         self.create_env_fn, self.seed, self.started = create_env_fn, seed, 0
-        self.replacements = replacements
         self._prepare(policy, sync, total_frames, timeout)
         self._pending: dict[Any, tuple[int, Any, float]] = {}
         cluster = _cluster(address, cpus=int(num_workers * remote_configs["num_cpus"]))
@@ -122,6 +115,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 weight_updater=RemoteModuleWeightUpdater(),
                 **kwargs,
             )
+        self.replacements = replacements
 
     # Workers ---------------------------------------------------------------------------------
 

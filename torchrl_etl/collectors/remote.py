@@ -24,6 +24,7 @@ __all__ = [
     "seeded_env",
     "training_seed",
     "weights_of",
+    "worker_options",
     "worker_seed",
 ]
 
@@ -202,13 +203,10 @@ def cpu_copy(policy: TensorDictModuleBase) -> TensorDictModuleBase:
 def check_arguments(
     create_env_fn: Any,
     policy: Any,
-    *,
     num_workers: int,
     frames_per_batch: int,
     sync: bool,
     timeout: float,
-    collector_class: Any,
-    collector_kwargs: Mapping[str, Any],
 ) -> None:
     """Raise ValueError or TypeError with the value, what is expected, and a fix."""
     if not callable(create_env_fn) or isinstance(create_env_fn, EnvBase):
@@ -229,14 +227,21 @@ def check_arguments(
             f"{num_workers * max(1, round(frames_per_batch / num_workers))}."
         )
     check_real("(0, inf)", timeout=timeout)
+
+
+def worker_options(
+    collector_class: Any, collector_kwargs: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """``collector_kwargs`` with our default. Raises as :func:`check_arguments` does."""
     if not (isinstance(collector_class, type) and issubclass(collector_class, Collector)):
         raise TypeError(
             f"collector_class is {collector_class!r}; a worker runs one environment in its own "
             "process, so it must be torchrl.collectors.Collector or a subclass. For more "
             "simulators in a worker use make_env(..., num_envs=N); for more processes, num_workers."
         )
-    managed = sorted(MANAGED & set(collector_kwargs))
+    managed = sorted(MANAGED.intersection(collector_kwargs or ()))
     if managed:
         raise ValueError(
             f"collector_kwargs has {', '.join(managed)}, which the workers set; leave them out."
         )
+    return {"auto_register_policy_transforms": False, **(collector_kwargs or {})}
