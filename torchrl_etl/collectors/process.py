@@ -34,7 +34,6 @@ class _OwnWeights:
         num_workers: int,
         **kwargs: Any,
     ) -> None:
-        self._learner = policy
         kwargs = {"collector_class": VectorCollector, "use_buffers": True, **kwargs}
         with stop_signals_blocked():  # workers inherit this; their imports take seconds
             super().__init__(
@@ -44,6 +43,7 @@ class _OwnWeights:
                 num_threads=torch.get_num_threads(),  # TorchRL would subtract one per worker
                 **kwargs,
             )
+        self._learner = policy
 
     def update_policy_weights_(
         self, policy_or_weights: TensorDictBase | nn.Module | None = None, **kwargs: Any

@@ -87,6 +87,7 @@ class VectorCollector(Collector):
                 f"VectorCollector takes no {given[0]}; leave it out, or use "
                 "torchrl.collectors.Collector."
             )
+        # Taken before TorchRL's constructor, which resets the environment and so draws.
         self._random = torch.get_rng_state()
         kwargs |= {
             "trust_policy": True,
