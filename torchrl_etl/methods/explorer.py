@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -11,7 +10,7 @@ from tensordict import TensorDictBase
 
 from torchrl_etl.checks import naming
 from torchrl_etl.exploration import EXPLORATIONS, Exploration
-from torchrl_etl.learners import Term
+from torchrl_etl.learners import SACLearner, Term
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies import SYNERGY_MODELS, ActionSelector, SynergyModel
 from torchrl_etl.training.context import Context
@@ -73,25 +72,20 @@ class Explorer:
             reward=self.exploration.reward,
         )
         self.fitter = learner.only(*fitted)
+        updated: SACLearner | None = learner
+        if not self.exploration.trains_policy:
+            updated = self.fitter if fitted else None  # none: the model is fitted once, at the end
         env_options = {"activations": True} if fit["actions"] == "activation" else {}
         self.stage = context.stage(
             learner,
             "explore",
+            updated=updated,
             env_options=env_options,
             env_transforms=self.exploration.reset_transforms(),
             transforms=self.relabel,
-            **self._updates(),
             keep=(*self.exploration.keep, *self.selector.keep),
         )
         self.seed = self.stage.seed
-
-    def _updates(self) -> dict[str, Any]:
-        """Stage arguments that replace or defer updates if the exploration does not learn."""
-        if self.exploration.trains_policy:
-            return {}
-        if self.model.loss is None:  # the model is fitted once, on all actions
-            return {"learning_starts": sys.maxsize}
-        return {"updated": self.fitter}
 
     def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyMap]:
         """Finish the training of the synergy model; returns the decoder for stage 2.

@@ -266,6 +266,7 @@ class Context:
             configured.pop(key, None)
         fixed = {
             "name": section,
+            "updated": learner,
             "seed": stage_seed(self.config.seed, section),
             "device": self.device,
             "action_repeat": self.config.action_repeat,

@@ -68,6 +68,8 @@ class Stage:
         make_env (callable): builds the environment to collect from, transforms included.
 
     Keyword Args:
+        updated (SACLearner or None): the learner to update: ``learner``, one that shares its
+            networks (:meth:`~torchrl_etl.learners.SACLearner.only`), or none.
         frames (int): budget of the stage, in environment frames.
         seed (int): seed of the stage.
         device (torch.device): device of the buffer and of sampled batches.
@@ -84,7 +86,6 @@ class Stage:
         keep (sequence of NestedKey): additional entries of a transition to store.
         transforms (sequence of Transform): applied to rows sampled for many updates at once;
             transforms that depend on current weights belong to the learner instead.
-        updated (SACLearner, optional): learner to update. Default: ``learner``.
         prefill_size (int): transitions to allocate for a prefill, on top of the budget. Default: 0.
         action_repeat (int): frames per transition. Default: 1.
         restart_seed (int): change it to collect other episodes with the same ``seed``, for example
@@ -100,6 +101,7 @@ class Stage:
         learner: SACLearner,
         make_env: Callable[[], EnvBase],
         *,
+        updated: SACLearner | None,
         frames: int,
         seed: int,
         device: torch.device,
@@ -114,7 +116,6 @@ class Stage:
         n_steps: int = 1,
         keep: Sequence[NestedKey] = (),
         transforms: Sequence[Transform] = (),
-        updated: SACLearner | None = None,
         prefill_size: int = 0,
         action_repeat: int = 1,
         restart_seed: int = 0,
@@ -125,11 +126,11 @@ class Stage:
         check_integer(0, learning_starts=learning_starts)
         check_real("(0, inf)", reward_scale=reward_scale)
         check_choice("buffer_storage", buffer_storage, ("memory", "memmap"))
-        self.name, self.learner, self.seed, self.device = name, learner, seed, device
+        self.name, self.learner, self.updated = name, learner, updated
+        self.seed, self.device = seed, device
         self.budget, self.action_repeat, self.reward_scale = frames, action_repeat, reward_scale
         self.batch_size, self.replay_ratio = batch_size, replay_ratio
         self.learning_starts, self.restart_seed = learning_starts, restart_seed
-        self.updated = learner if updated is None else updated
         self.progress = Progress()
         self.batches: Batches | None = None
         acting = {"make_env": make_env, "policy": learner.behavior, "device": device}
@@ -171,7 +172,8 @@ class Stage:
             self.buffer.extend(rows.select(*self._kept))
         self.progress.frames += self.action_repeat * batch.numel()
         self.progress.episodes += int(batch["next", "done"].sum())
-        if self.frames > self.learning_starts and len(self.buffer):
+        learns = self.updated is not None and self.frames > self.learning_starts
+        if learns and len(self.buffer):
             self.add_due_updates(batch.numel())
         return batch.reshape(-1)
 
