@@ -73,13 +73,34 @@ def test_only_asynchronous_batches_under_way_have_older_weights(start):
 
 
 @pytest.mark.parametrize("sync", [True, False])
+def test_another_iteration_goes_on_with_pending_requests(start, sync):
+    collector, _ = start(sync=sync, total_frames=96)
+    seen = []
+    for _ in range(2):
+        seen.append(next(iter(collector)))
+        collector.update_policy_weights_()
+    assert origin(seen[0].flatten(), "policy_version") == 0
+    seen += collector
+    assert distinct_frames(seen) == collector.collected_frames == 96
+    assert list(collector) == []
+
+
+def test_weights_of_another_policy_are_refused(start):
+    collector, policy = start()
+    other = torch.nn.ModuleDict({"weight": torch.nn.Linear(2, 2)})
+    with pytest.raises(ValueError, match=r"shape of the weights .* is .*, and .* in the policy"):
+        collector.update_policy_weights_(other)
+    collector.update_policy_weights_(policy)
+
+
+@pytest.mark.parametrize("sync", [True, False])
 def test_killed_worker_ends_the_run_and_is_named(start, sync):
     collector, _ = start(sync=sync)
     batches = iter(collector)
     next(batches)
     os.kill(collector.jobs[1].pid, signal.SIGKILL)
     began = time.monotonic()
-    with pytest.raises(RuntimeError, match=r"worker 1 .*resume=FOLDER"):
+    with pytest.raises(RuntimeError, match=r"worker 1 .*continue from your last checkpoint"):
         for _ in range(10_000):
             next(batches)
     assert time.monotonic() - began < 20

@@ -101,6 +101,17 @@ def test_only_asynchronous_batches_under_way_have_older_weights(start):
         assert set(of_worker[1:]) == {1}
 
 
+def test_another_iteration_goes_on_with_pending_requests(start):
+    collector, _ = start(sync=False)
+    versions = []
+    for _ in range(3):
+        batch = next(iter(collector))
+        versions.append(origin(batch, "policy_version"))
+        collector.update_policy_weights_()
+    assert len(collector._pending) == 2  # one for each worker
+    assert versions[:1] == [0]
+
+
 @pytest.mark.parametrize("sync", [True, False])
 def test_replacement_of_a_killed_worker_has_the_newest_weights(start, sync):
     collector, policy = start(sync=sync, replacements=1)
@@ -122,7 +133,7 @@ def test_replacement_of_a_killed_worker_has_the_newest_weights(start, sync):
 
     os.kill(pid(collector, 1), signal.SIGKILL)
     with pytest.raises(
-        RuntimeError, match=r"worker 1 was lost.*1 were already replaced.*resume=FOLDER"
+        RuntimeError, match=r"worker 1 was lost.*1 were already replaced.*your last checkpoint"
     ):
         for _ in range(1000):
             next(batches)

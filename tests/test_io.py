@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_etl.io import read_bytes, read_json
+from torchrl_etl.io import read_bytes, read_json, replaceable_folder
 
 
 class OurError(ValueError):
@@ -44,3 +44,11 @@ def test_json_of_the_wrong_type_is_named(
     (tmp_path / "file").write_text(content)
     with pytest.raises(OurError, match=f"file is not a JSON {word}; mend it"):
         read_json(tmp_path / "file", kind, OurError, "mend it")
+
+
+@pytest.mark.parametrize("where", [".", ".."])
+def test_current_folder_is_not_replaced(where: str, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "inner").mkdir()
+    monkeypatch.chdir(tmp_path / "inner")
+    with pytest.raises(ValueError, match="is in use as the current folder; choose another"):
+        replaceable_folder(where, ["inner"], "a bundle", ValueError)

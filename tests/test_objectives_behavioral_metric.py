@@ -258,6 +258,19 @@ def test_plain_networks_are_refused() -> None:
         BehavioralMetricLoss(nn.Linear(2, 2))
 
 
+@pytest.mark.parametrize("key", ["reward", "terminated"])
+@pytest.mark.parametrize("shape", [[8], [8, 2]])
+def test_entries_that_are_not_one_number_a_state_are_refused(key: str, shape: list[int]) -> None:
+    batch = TensorDict({"observation": torch.rand(8, 3)}, [8])
+    batch["next"] = batch.clone().set("reward", torch.rand(8, 1))
+    batch["next", "terminated"] = torch.zeros(8, 1, dtype=torch.bool)
+    wrong = batch["next", key].new_zeros(shape)
+    batch["next", key] = wrong
+    loss = BehavioralMetricLoss(StateEncoder(3, 2))
+    with pytest.raises(ValueError, match=rf"'{key}'\) has shape \{shape}.*must be \[\*, 1\]"):
+        loss(batch)
+
+
 def test_batch_of_one_transition_is_refused() -> None:
     with pytest.raises(ValueError, match="at least two"):
         BehavioralMetricLoss(table(*ROWS))(transitions([0], [1], [0.0], [False], 3))

@@ -75,6 +75,15 @@ def test_action_units_do_not_change_the_loss() -> None:
     torch.testing.assert_close(*values)
 
 
+def test_actions_in_double_precision_have_the_loss_of_single_precision() -> None:
+    loss, action = GMVAELoss(GMVAE(4, 2)), torch.rand(8, 4)
+    values = []
+    for each in (action, action.double()):
+        torch.manual_seed(0)
+        values.append(loss(TensorDict({"action": each}, [8]))["loss_gmvae"])
+    assert torch.equal(*values)
+
+
 def test_latents_are_sampled_inside_the_loss() -> None:
     # TorchRL turns exploration off inside losses, but a VAE must sample its latents.
     loss, data = GMVAELoss(GMVAE(ACTION_DIM, LATENT_DIM)), actions()

@@ -182,6 +182,24 @@ def test_from_directions_has_the_given_slope_and_stays_in_bounds() -> None:
     assert ((far > decoder.low) & (far < decoder.high)).all()
 
 
+def test_encode_is_the_best_within_the_box_for_nearly_parallel_directions() -> None:
+    directions = torch.tensor([[0.3, 0.3, 0.0], [0.3, 0.3, 0.01]])
+    decoder = SynergyDecoder.from_directions(torch.zeros(3), directions)
+    action = decoder(torch.tensor([[-0.6, 1.0]])) + torch.tensor([[0.0, 0.0, 0.02]])
+    for dtype in (torch.float32, torch.float16):
+        coefficients = decoder.to(dtype).encode(action.detach())
+        assert coefficients.dtype == dtype
+        torch.testing.assert_close(
+            coefficients.float(), torch.tensor([[-0.6, 1.0]]), atol=0.03, rtol=0
+        )
+
+
+def test_coefficients_in_double_precision_are_decoded_in_the_decoders() -> None:
+    decoder = SynergyDecoder.from_gmvae(GMVAE(4, 2), residual=1.0)
+    synergy = torch.zeros(3, 6)
+    assert torch.equal(decoder(synergy.double()), decoder(synergy))
+
+
 def test_from_directions_survives_a_bundle_round_trip(tmp_path: Path) -> None:
     decoder = SynergyDecoder.from_directions(torch.zeros(4), torch.rand(2, 4), residual=0.5)
     save_bundle(decoder, tmp_path / "synergies", task="toy", actuators=list("abcd"))

@@ -64,7 +64,8 @@ def replaceable_folder(
 ) -> Path:
     """The resolved path of a folder to be replaced, which may hold only files of these names.
 
-    If it holds others, or is a file, raises ``error``; ``what`` names the content to be saved.
+    If it holds others, is a file, or is the current folder, raises ``error``; ``what`` names the
+    content to be saved.
 
     Examples:
         >>> replaceable_folder("recipes", ["card.json"], "an entry", ValueError)
@@ -76,6 +77,8 @@ def replaceable_folder(
     if folder.is_dir():
         others = sorted({file.name for file in folder.iterdir()} - {*names})
         held = f"holds {others[0]!r}" if others else ""
+        if Path.cwd().is_relative_to(folder):
+            raise error(f"{folder} is in use as the current folder; choose another for {what}.")
     else:
         held = "is a file" if folder.exists() else ""
     if held:

@@ -17,7 +17,7 @@ def as_array(values: Tensor | ArrayLike) -> np.ndarray:
         array([1., 2.])
     """
     if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy()
+        values = values.detach().cpu().double().numpy()
     return np.asarray(values, dtype=np.float64)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import partial
@@ -159,6 +159,9 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
             self._asked[worker] = time.monotonic()
         except RuntimeError as error:
             raise self._lost(worker, f"did not receive weights ({error})") from error
+
+    def _requested(self) -> Collection[int]:
+        return self._trackers
 
     def _receive(self) -> tuple[int, TensorDictBase]:
         worker = self._wait()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -189,6 +189,9 @@ class RayWorkers(RemoteWorkers, RayCollector):
                 self._stored = self._weights, ray.put(self._weights)
             push = actor.update_policy_weights_.remote(self._stored[1])
         self._pending[actor.next.remote()] = worker, push, time.monotonic()
+
+    def _requested(self) -> Collection[int]:
+        return {worker for worker, *_ in self._pending.values()}
 
     def _receive(self) -> tuple[int, TensorDictBase]:
         import ray

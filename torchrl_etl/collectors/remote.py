@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -92,15 +92,17 @@ class RemoteWorkers:
     def _receive(self) -> tuple[int, TensorDictBase]:
         """The next batch of any worker with a pending request, within the timeout."""
 
+    @abstractmethod
+    def _requested(self) -> Collection[int]:
+        """Workers with a pending request."""
+
     def iterator(self) -> Iterator[TensorDictBase]:
+        """Batches until ``total_frames``. Another iterator goes on where the last one was left."""
         workers = range(self.num_workers)
-        if not self._sync:
-            for worker in workers:
-                self._request(worker)
         while self.collected_frames < self.total_frames and not self._stopped:
+            for worker in {*workers}.difference(self._requested()):
+                self._request(worker)
             if self._sync:
-                for worker in workers:
-                    self._request(worker)
                 batches = dict(self._receive() for _ in workers)
                 batch = torch.stack([batches[worker] for worker in workers])
             else:
@@ -129,8 +131,22 @@ class RemoteWorkers:
         Args:
             policy_or_weights (nn.Module or TensorDictBase, optional): a policy, or its weights.
                 Defaults to the current weights of the constructor's policy.
+
+        Raises:
+            ValueError: if they do not have the names and shapes of the constructor's policy.
         """
-        self._weights = weights_of(self.policy if policy_or_weights is None else policy_or_weights)
+        weights = weights_of(self.policy if policy_or_weights is None else policy_or_weights)
+        shapes, known = (
+            {key: tuple(value.shape) for key, value in each.items(True, True)}
+            for each in (weights, self._weights)
+        )
+        if shapes != known:
+            key = min({*shapes.items()} ^ {*known.items()}, key=str)[0]
+            raise ValueError(
+                f"The shape of the weights {key!r} is {shapes.get(key)}, and {known.get(key)} in "
+                "the policy that the workers have; build a new collector for another policy."
+            )
+        self._weights = weights
         self.policy_version += 1
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
@@ -145,7 +161,7 @@ class RemoteWorkers:
         if self.collected_frames:
             advice = (
                 f" The {self.collected_frames} frames delivered so far were counted once; continue "
-                "from the last checkpoint with resume=FOLDER."
+                "from your last checkpoint."
             )
         return RuntimeError(f"{type(self).__name__}: worker {worker} {cause}.{advice}")
 

@@ -6,6 +6,7 @@ They have no keys, modules or state, and accept any number of leading batch dime
 embedding dimensions, ``C`` mixture components.
 """
 
+from torchrl_etl.functional.bounded_least_squares import bounded_least_squares
 from torchrl_etl.functional.categorical import (
     categorical_cross_entropy,
     categorical_mean,
@@ -35,6 +36,7 @@ from torchrl_etl.functional.tanh_sum import tanh_sum, tanh_sum_log_slope
 
 __all__ = [
     "GMVAEBound",
+    "bounded_least_squares",
     "categorical_cross_entropy",
     "categorical_kl",
     "categorical_mean",

@@ -80,6 +80,7 @@ class ActionDecoder(nn.Module):
     def normalize(self, action: Tensor) -> Tensor:
         """Map [low, high] to [-1, 1]."""
         check_width(self.action_dim, action=action)
+        action = action.to(self.low.dtype)  # DMControl's are in double precision
         return 2 * (action - self.low) / (self.high - self.low) - 1
 
     def denormalize(self, unit: Tensor) -> Tensor:
@@ -253,7 +254,7 @@ class GMVAE(nn.Module):
         """
         if not isinstance(action, Tensor):
             action = as_actions(action, low=self.low, high=self.high)
-        posterior = self.encode(action.to(self.low))
+        posterior = self.encode(action.to(self.low.device))
         best = posterior.logits.argmax(-1)[..., None, None]
         return posterior.loc.take_along_dim(best, -2).squeeze(-2)
 

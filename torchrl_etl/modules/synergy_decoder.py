@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_etl.checks import check_width
-from torchrl_etl.functional import tanh_sum, tanh_sum_log_slope
+from torchrl_etl.functional import bounded_least_squares, tanh_sum, tanh_sum_log_slope
 from torchrl_etl.modules.gmvae import GMVAE, ActionDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.modules.synergy_map import SynergyMap
@@ -55,6 +55,7 @@ class _ScaledDecoder(nn.Module):
     def forward(self, synergy: Tensor) -> Tensor:
         direct = self.decoder.action_dim if self.residual else 0
         check_width(self.decoder.latent_dim + direct, synergy=synergy)
+        synergy = synergy.to(self.center.dtype)
         if not self.residual:
             return self.decoder(self.center + self.scale * synergy)
         return self.decoder.denormalize(tanh_sum(*self.summands(synergy)))
@@ -257,8 +258,8 @@ class SynergyDecoder(SynergyMap):
     def encode(self, action: Tensor | np.ndarray) -> Tensor:
         """Coefficients [*, d] of actions [*, n], clamped to the policy's box [-1, 1]^d.
 
-        An affine decoder is inverted by least squares before the bounds, with actions clamped to
-        0.99 of their half range. Any other decoder uses its :attr:`encoder`, also after
+        For an affine decoder, the least squares within this box before the bounds, with actions
+        clamped to 0.99 of their half range. Any other decoder uses its :attr:`encoder`, also after
         fine-tuning.
 
         Raises:
@@ -269,15 +270,18 @@ class SynergyDecoder(SynergyMap):
         if self.is_affine:
             (layer,) = (m for m in scaled.decoder.modules() if isinstance(m, nn.Linear))
             unit = scaled.decoder.normalize(action).clamp(-NEAREST, NEAREST)
-            latent = (unit.atanh() - layer.bias) @ layer.weight.pinverse().mT
-        elif self.encoder is not None:
+            offset = layer.bias + layer.weight @ scaled.center
+            weight, target = layer.weight * scaled.scale, unit.atanh() - offset
+            solver_dtype = torch.promote_types(action.dtype, torch.float32)  # none for half
+            found = bounded_least_squares(weight.to(solver_dtype), target.to(solver_dtype))
+            return found.to(action.dtype)
+        if self.encoder is not None:
             latent = self.encoder.infer(action)
-        else:
-            raise RuntimeError(
-                "This decoder has no encoder, so actions cannot be turned into its coefficients; "
-                "make it with SynergyDecoder.from_gmvae, or load a bundle that holds one."
-            )
-        return ((latent - scaled.center) / scaled.scale).clamp(-1, 1)
+            return ((latent - scaled.center) / scaled.scale).clamp(-1, 1)
+        raise RuntimeError(
+            "This decoder has no encoder, so actions cannot be turned into its coefficients; "
+            "make it with SynergyDecoder.from_gmvae, or load a bundle that holds one."
+        )
 
     @property
     def config(self) -> dict[str, Any]:

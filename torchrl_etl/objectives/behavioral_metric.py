@@ -15,8 +15,14 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
-from torchrl_etl.objectives.checks import check_parts, read
-from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners, target_params
+from torchrl_etl.objectives.checks import check_parts
+from torchrl_etl.objectives.pairs import (
+    embedded_ends,
+    outputs,
+    partners,
+    read_scalars,
+    target_params,
+)
 
 __all__ = ["BehavioralMetricLoss"]
 
@@ -192,12 +198,12 @@ class BehavioralMetricLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
-        reward = read(type(self).__name__, tensordict["next"], self.tensor_keys.reward, "next")
+        embedding, next_embedding = embedded_ends(self, tensordict)
+        samples, following = len(embedding), tensordict["next"]
+        reward = read_scalars(self, following, self.tensor_keys.reward, samples)
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten() * self.reward_scale
-        partner = partners(reward.numel(), reward.device, self.pairs)
-
-        embedding, next_embedding = embedded_ends(self, tensordict)
+        partner = partners(samples, reward.device, self.pairs)
         out: dict[str, Tensor] = {}
         if self.divergence == "gaussian":
             loc, scale = self._predict(tensordict)

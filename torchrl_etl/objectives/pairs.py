@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 from torchrl_etl.draws import uniform_order
 from torchrl_etl.objectives.checks import read
 
-__all__ = ["embedded_ends", "outputs", "partners", "target_params"]
+__all__ = ["embedded_ends", "outputs", "partners", "read_scalars", "target_params"]
 
 
 def partners(
@@ -46,6 +46,20 @@ def outputs(
     return written.get(network.out_keys[0]).flatten(0, -2)
 
 
+def read_scalars(
+    loss: LossModule, following: TensorDictBase, key: NestedKey, samples: int
+) -> Tensor:
+    """An entry [*, 1] of the next states with a number for each of the ``samples``."""
+    values = read(type(loss).__name__, following, key, "next")
+    if values.shape[-1:] != (1,) or values.numel() != samples:
+        raise ValueError(
+            f"{type(loss).__name__}: the entry {unravel_key(('next', key))!r} has shape "
+            f"{list(values.shape)}; it must be [*, 1], with one number for each of the {samples} "
+            "embedded states."
+        )
+    return values
+
+
 def target_params(loss: LossModule) -> TensorDictParams:
     """Parameters of a loss's target encoder, or of its encoder if it has no target.
 
@@ -64,5 +78,5 @@ def embedded_ends(loss: LossModule, tensordict: TensorDictBase) -> tuple[Tensor,
     with torch.no_grad():
         following = tensordict["next"]
         next_embedding = outputs(loss.encoder, target_params(loss), following)
-        ended = read(type(loss).__name__, following, loss.tensor_keys.terminated, "next")
+        ended = read_scalars(loss, following, loss.tensor_keys.terminated, len(embedding))
         return embedding, next_embedding.masked_fill(ended.reshape(-1, 1), 0.0)

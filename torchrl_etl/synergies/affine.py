@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_etl.checks import check_integer
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.modules.synergy_decoder import NEAREST, percentile_box
-from torchrl_etl.synergies.model import SynergyModel
+from torchrl_etl.synergies.model import SynergyModel, check_num_synergies
 
 __all__ = ["AffineSynergies"]
 
@@ -42,12 +41,7 @@ class AffineSynergies(SynergyModel):
     """Actions in :meth:`fit`; of more, a regular stride is taken."""
 
     def __init__(self, low: Tensor, high: Tensor, num_synergies: int) -> None:
-        check_integer(1, num_synergies=num_synergies)
-        if num_synergies > len(low):
-            raise ValueError(
-                f"num_synergies is {num_synergies} but there are only {len(low)} actuators; "
-                f"choose at most {len(low)}."
-            )
+        check_num_synergies(num_synergies, len(low))
         self.low, self.high, self.num_synergies = low, high, num_synergies
 
     @abstractmethod

@@ -13,7 +13,7 @@ from torchrl_etl.checks import check_integer, check_real, check_sizes
 from torchrl_etl.modules import GMVAE, SynergyDecoder
 from torchrl_etl.modules.recorded_actions import as_actions
 from torchrl_etl.objectives import GMVAELoss
-from torchrl_etl.synergies.model import SynergyModel
+from torchrl_etl.synergies.model import SynergyModel, check_num_synergies
 
 __all__ = ["GMVAESynergies", "component_shares", "fit_gmvae"]
 
@@ -54,6 +54,7 @@ class GMVAESynergies(SynergyModel):
         check_real("(0, inf)", lr=lr)
         check_sizes(hidden=hidden)
         check_integer(1, updates=updates)
+        check_num_synergies(num_synergies, len(low))
         self.num_synergies, self.lr, self.updates = num_synergies, lr, updates
         self.model = GMVAE(
             len(low),

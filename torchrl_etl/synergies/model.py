@@ -11,10 +11,21 @@ from typing import Any, ClassVar
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_etl.checks import check_integer
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import save_bundle
 
-__all__ = ["SynergyModel"]
+__all__ = ["SynergyModel", "check_num_synergies"]
+
+
+def check_num_synergies(num_synergies: int, actuators: int) -> None:
+    """Raise ``TypeError`` or ``ValueError`` unless it is an integer from 1 to ``actuators``."""
+    check_integer(1, num_synergies=num_synergies)
+    if num_synergies > actuators:
+        raise ValueError(
+            f"num_synergies is {num_synergies} but there are only {actuators} actuators; "
+            f"choose at most {actuators}."
+        )
 
 
 class SynergyModel(ABC):

@@ -161,6 +161,7 @@ class LatentAction(ModuleTransform):
                 f"{self.latent_key!r} has shape {list(latent.shape)}; it must end with "
                 f"{list(self.latent_spec.shape)}."
             )
+        latent = latent.to(self.latent_spec.dtype)
         entry = self.module(TensorDict({self.module.in_keys[0]: latent}, batch_size))
         action = entry.get(self.module.out_keys[0])
         return action if self.parent is None else action.to(self._action_leaf.dtype)
