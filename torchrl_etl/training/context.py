@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
@@ -44,11 +45,6 @@ if TYPE_CHECKING:
 __all__ = ["Context"]
 
 Actor: TypeAlias = ProbabilisticTensorDictSequential
-
-NOT_OF_THE_STAGE = (
-    *("actor", "critic", "sac", "noise", "init_random_frames"),  # the learner's
-    *("decoder", "prefill", "fit"),  # the method's
-)
 
 
 @dataclass(frozen=True)
@@ -261,9 +257,8 @@ class Context:
             transforms=tuple(env_transforms),
             **{**self.task_options, **other, **(env_options or {})},
         )
-        configured = self.options(section)
-        for key in NOT_OF_THE_STAGE:
-            configured.pop(key, None)
+        takes = signature(Stage).parameters  # the section also configures learner and method
+        configured = {k: v for k, v in self.options(section).items() if k in takes}
         fixed = {
             "name": section,
             "updated": learner,
