@@ -21,8 +21,8 @@ from tests.point_env import PointTask
 from tests.synergy_policy import decode_to, synergy_policy
 from torchrl_etl.collectors import Batches, CollectionError, VectorCollector, make_batches
 from torchrl_etl.envs import make_env
-from torchrl_etl.learners.parts import episode_numbers
 from torchrl_etl.modules import make_actor
+from torchrl_etl.modules.return_scale import episode_numbers
 
 FRAMES = 48
 

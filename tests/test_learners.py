@@ -16,7 +16,7 @@ from tests.stages import fill, learn_stage
 from torchrl_etl.learners import SACLearner, Term, WarmedUpEMA
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.modules import StateEncoder, make_actor, make_critic
-from torchrl_etl.objectives import BehavioralMetricLoss
+from torchrl_etl.objectives import BehavioralMetricLoss, make_sac_loss
 
 RATES = (0.1, 0.03)
 
@@ -142,10 +142,11 @@ class Measures(Transform):
 def test_target_network_is_updated_when_a_transform_reads_the_loss():
     spec = Bounded(-1, 1, shape=(2,))
     loss = BehavioralMetricLoss(StateEncoder(3, 2, hidden=(8,)))
+    actor = make_actor({"observation": 3}, spec)
+    critic = make_critic({"observation": 3, "action": 2})
     learner = SACLearner(
-        make_actor({"observation": 3}, spec),
-        make_critic({"observation": 3, "action": 2}),
-        action_spec=spec,
+        actor,
+        make_sac_loss(actor, critic, action_spec=spec),
         terms=[Term(loss, tau=0.5)],
         transforms=[Measures(loss)],
     )

@@ -16,6 +16,7 @@ from torchrl_etl.learners import SACLearner, StackedLearners
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.learners.compiled import compiled
 from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.objectives import make_sac_loss
 
 SEEDS = (0, 1)
 MAKERS = {
@@ -91,7 +92,7 @@ def test_stacked_dynsyn_learners_keep_their_muscle_groups():
         actor = make_dynsyn_actor({"observation": 3}, spec, groups, hidden=(8,), slope=1.0, start=0)
         actor[0].module.advance(1)
         critic = make_critic({"observation": 3, "action": 4}, hidden=(8,))
-        learners.append(SACLearner(actor, critic, action_spec=spec))
+        learners.append(SACLearner(actor, make_sac_loss(actor, critic, action_spec=spec)))
         end = torch.zeros(32, 1, dtype=torch.bool)
         following = {"reward": torch.randn(32, 1), "done": end, "terminated": end}
         following["observation"] = torch.randn(32, 3)
@@ -201,7 +202,8 @@ def paid_learners(make_transform):
         actor = make_actor({"observation": 3}, spec)
         critic = make_critic({"observation": 3, "action": 2})
         transforms = [make_transform()]
-        learners.append(SACLearner(actor, critic, action_spec=spec, transforms=transforms))
+        sac = make_sac_loss(actor, critic, action_spec=spec)
+        learners.append(SACLearner(actor, sac, transforms=transforms))
     end = torch.zeros(2, 32, 1, dtype=torch.bool)
     following = {"observation": torch.randn(2, 32, 3), "done": end, "terminated": end}
     entries = {"observation": torch.randn(2, 32, 3), "action": torch.zeros(2, 32, 2)}

@@ -2,7 +2,7 @@
 
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import NORMALIZED, Objective
-from torchrl_etl.learners.parts import entropy_target, from_observation
+from torchrl_etl.learners.policy import from_observation
 from torchrl_etl.learners.sac import SACLearner
 from torchrl_etl.learners.stacked import StackedLearners
 from torchrl_etl.learners.term import Term
@@ -14,6 +14,5 @@ __all__ = [
     "StackedLearners",
     "Term",
     "WarmedUpEMA",
-    "entropy_target",
     "from_observation",
 ]

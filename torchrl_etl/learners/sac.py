@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call
-from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_real
@@ -25,15 +20,11 @@ from torchrl_etl.learners.adam import make_optimizer, parameter_groups
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import Objective
-from torchrl_etl.learners.parts import (
-    episode_numbers,
-    from_observation,
-    make_loss,
-    make_return_scale,
-)
+from torchrl_etl.learners.policy import from_observation
 from torchrl_etl.learners.term import Term
-from torchrl_etl.modules import RunningNorm, Scheduled, SynergyMap
-from torchrl_etl.objectives import FusedSoftUpdate
+from torchrl_etl.modules import ReturnScale, RunningNorm, Scheduled, SynergyMap
+from torchrl_etl.modules.return_scale import episode_numbers
+from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss
 
 __all__ = ["Gradients", "SACLearner"]
 
@@ -48,12 +39,11 @@ class SACLearner:
 
     Args:
         actor (ProbabilisticTensorDictSequential): writes an action, or what ``decoder`` reads.
-        critic (TensorDictModule): Q-network, copied ``num_critics`` times.
+        sac (LeanSACLoss): SAC's losses of this actor, see
+            :func:`~torchrl_etl.objectives.make_sac_loss`.
 
     Keyword Args:
-        action_spec (Bounded): spec of the actor's output, unbatched.
         decoder (SynergyMap, optional): maps the actor's output to actions.
-        train_decoder (bool): train the decoder on the actor loss. Default: ``False``.
         behavior (TensorDictModuleBase, optional): policy that collects, such as the actor with
             exploration noise. Its :class:`~torchrl_etl.modules.Scheduled` modules are told how far
             the run is. Default: the actor.
@@ -63,63 +53,53 @@ class SACLearner:
             transform lists networks that it reads but does not own. Default: none.
         normalizer (RunningNorm, optional): normalizes ``observation`` to
             :data:`~torchrl_etl.learners.NORMALIZED`, which actor and critic must then read.
+        return_scale (ReturnScale, optional): scales the reward that SAC learns from.
         reward (NestedKey): reward that SAC learns from, below ``"next"``. Default: ``"reward"``.
-        gamma (float): discount factor. Default: 0.99.
         tau (float): EMA rate of the target critics. Default: 0.005.
         lr, lr_end (float): initial learning rate, and the fraction of every learning rate that is
             left at the last frame (linear decay). Default: 3e-4 and 1.
         ema_decay (float): EMA decay of the actor that is evaluated and saved. Default: 0.
-        alpha_init (float): initial temperature. Default: 1.
-        target_entropy (float or "auto"): see :func:`entropy_target`. Default: ``"auto"``.
-        entropy_dims (int, optional): measure the entropy of the first ``entropy_dims`` actor
-            outputs only. Default: entropy of the action.
-        num_critics (int): ensemble size; targets and actor loss use the minimum. Default: 2.
-        loss_function (str): loss of scalar critics. Default: ``"l2"``.
-        return_bound (float, optional): scale rewards so that returns stay within ± this bound.
-        bins (int): above 1, critics are categorical with ``bins`` atoms in ±``return_bound``.
         compile (bool): compile updates; on CUDA, also capture each as one CUDA graph.
 
     Raises:
-        ValueError: if a number is out of range, or ``bins`` is above 1 without ``return_bound``.
+        ValueError: if a number is out of range.
 
     Examples:
         >>> import torch
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> from torchrl_etl.learners import SACLearner
         >>> from torchrl_etl.modules import make_actor, make_critic
+        >>> from torchrl_etl.objectives import make_sac_loss
         >>> spec = Bounded(-1, 1, shape=(2,))
         >>> actor = make_actor({"observation": 3}, spec)
         >>> critic = make_critic({"observation": 3, "action": 2})
-        >>> learner = SACLearner(actor, critic, action_spec=spec)
-        >>> [entry for entry in learner.policy.in_keys]
-        ['observation']
+        >>> learner = SACLearner(actor, make_sac_loss(actor, critic, action_spec=spec))
+        >>> end = torch.zeros(8, 1, dtype=torch.bool)
+        >>> following = {"observation": torch.randn(8, 3), "reward": torch.zeros(8, 1)}
+        >>> following |= {"done": end, "terminated": end}
+        >>> entries = {"observation": torch.randn(8, 3), "action": torch.zeros(8, 2)}
+        >>> batch = TensorDict({**entries, "next": following}, [8])  # of any replay buffer
+        >>> bool(learner.update(batch)["loss_qvalue"] > 0)
+        True
     """
 
     def __init__(
         self,
         actor: ProbabilisticTensorDictSequential,
-        critic: TensorDictModule,
+        sac: LeanSACLoss,
         *,
-        action_spec: Bounded,
         decoder: SynergyMap | None = None,
-        train_decoder: bool = False,
         behavior: TensorDictModuleBase | None = None,
         terms: Sequence[Term] = (),
         transforms: Sequence[Transform] = (),
         normalizer: RunningNorm | None = None,
+        return_scale: ReturnScale | None = None,
         reward: NestedKey = "reward",
-        gamma: float = 0.99,
         tau: float = 0.005,
         lr: float = 3e-4,
         lr_end: float = 1.0,
         ema_decay: float = 0.0,
-        alpha_init: float = 1.0,
-        target_entropy: float | Literal["auto"] = "auto",
-        entropy_dims: int | None = None,
-        num_critics: int = 2,
-        loss_function: str = "l2",
-        return_bound: float | None = None,
-        bins: int = 1,
         compile: bool = False,
     ) -> None:
         check_real("(0, inf)", lr=lr)
@@ -127,24 +107,10 @@ class SACLearner:
         check_real("(0, 1]", tau=tau)
         check_real("[0, 1)", ema_decay=ema_decay)
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
-        self.gamma, self.lr_end, self.compile = gamma, lr_end, compile
-        scale = make_return_scale(gamma, return_bound)
-        sac = make_loss(
-            actor,
-            critic,
-            gamma,
-            return_bound,
-            action_spec=action_spec,
-            decoder=decoder,
-            train_decoder=train_decoder,
-            target_entropy=target_entropy,
-            entropy_dims=entropy_dims,
-            alpha_init=alpha_init,
-            num_critics=num_critics,
-            bins=bins,
-            loss_function=loss_function,
-        )
-        units = {"normalizer": normalizer, "return_scale": scale, "reward": reward}
+        self.lr_end, self.compile = lr_end, compile
+        # The loss creates these lazily; they must exist before optimizer and compiled updates do.
+        _ = sac.target_entropy, sac.value_estimator
+        units = {"normalizer": normalizer, "return_scale": return_scale, "reward": reward}
         self.objective = Objective(sac, actor, terms, **units, transforms=transforms)
         self.objective.to(self.device)
         self.statistics = self.objective.statistics

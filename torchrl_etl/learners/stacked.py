@@ -40,10 +40,12 @@ class StackedLearners:
         >>> from torchrl.data import Bounded
         >>> from torchrl_etl.learners import SACLearner, StackedLearners
         >>> from torchrl_etl.modules import make_actor, make_critic
+        >>> from torchrl_etl.objectives import make_sac_loss
         >>> spec = Bounded(-1, 1, shape=(2,))
         >>> def learner():
+        ...     actor = make_actor({"observation": 3}, spec)
         ...     critic = make_critic({"observation": 3, "action": 2})
-        ...     return SACLearner(make_actor({"observation": 3}, spec), critic, action_spec=spec)
+        ...     return SACLearner(actor, make_sac_loss(actor, critic, action_spec=spec))
         >>> flag = torch.zeros(5, 4, 1, dtype=torch.bool)
         >>> ends = {"reward": torch.zeros(5, 4, 1), "done": flag, "terminated": flag}
         >>> entries = {"observation": torch.randn(5, 4, 3), "action": torch.zeros(5, 4, 2)}

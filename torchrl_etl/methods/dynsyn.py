@@ -91,4 +91,5 @@ class DynSyn(Method):
         actor = self.context.actor(make=make_dynsyn_actor, groups=groups, **deviation)
         # The actor's log-probability has one dimension per group.
         first = [groups.index(group) for group in sorted(set(groups))]
-        return self.context.stage(self.context.learner(actor, entropy_spec=spec[first]))
+        loss = self.context.loss(actor, entropy_spec=spec[first])
+        return self.context.stage(self.context.learner(actor, loss=loss))

@@ -274,14 +274,15 @@ class ETL(Method):
         # The policy does not control the entropy of a residual with fixed noise.
         entropy_dims = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
         self.context.seed_everything("learn")
-        learner = self.context.learner(
-            self.context.actor(decoder=decoder, **self._quiet),
+        actor = self.context.actor(decoder=decoder, **self._quiet)
+        loss = self.context.loss(
+            actor,
             decoder=decoder,
             train_decoder=mode == "critic",
-            terms=[term],
             entropy_spec=decoder.synergy_spec[:entropy_dims],
             entropy_dims=entropy_dims,
         )
+        learner = self.context.learner(actor, decoder=decoder, loss=loss, terms=[term])
         room = self.context.config.explore.frames if self.prefills else 0
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)
 

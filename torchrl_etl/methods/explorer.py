@@ -65,11 +65,11 @@ class Explorer:
         learner = context.learner(
             actor,
             "explore",
-            inputs=self.exploration.inputs,
             behavior=self.exploration.behavior(context.behavior(actor, "explore")),
             terms=[*terms, *fitted],
             transforms=self.exploration.batch_transforms(),
             reward=self.exploration.reward,
+            loss=context.loss(actor, "explore", inputs=self.exploration.inputs),
         )
         self.fitter = learner.only(*fitted)
         updated: SACLearner | None = learner

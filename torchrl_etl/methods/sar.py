@@ -17,9 +17,9 @@ from torchrl_etl.checks import check_integer, check_real, naming
 from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
-from torchrl_etl.learners.parts import episode_numbers
 from torchrl_etl.methods.method import Method
 from torchrl_etl.modules import SARDecoder
+from torchrl_etl.modules.return_scale import episode_numbers
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import SARSynergies
 from torchrl_etl.training.context import Context

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_etl.checks import check_real
 from torchrl_etl.modules.running_moments import RunningMoments
 
-__all__ = ["ReturnScale"]
+__all__ = ["ReturnScale", "episode_numbers"]
 
 
 class ReturnScale(RunningMoments):
@@ -84,3 +85,13 @@ class ReturnScale(RunningMoments):
     def forward(self, reward: Tensor) -> Tensor:
         """Rewards of any shape in scaled units."""
         return reward / self.scale.to(reward.dtype)
+
+
+def episode_numbers(batch: TensorDictBase) -> Tensor:
+    """An episode number for each transition [*], unique across workers.
+
+    Workers of one machine share a numbering; each remote worker has its own.
+    """
+    number = batch["collector", "traj_ids"]
+    worker = batch.get(("collector", "worker"), None)
+    return number if worker is None else number + (worker << 32)

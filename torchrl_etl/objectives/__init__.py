@@ -2,6 +2,7 @@
 
 from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
 from torchrl_etl.objectives.decoder import DecoderLoss
+from torchrl_etl.objectives.factory import entropy_target, make_sac_loss
 from torchrl_etl.objectives.gmvae import GMVAELoss
 from torchrl_etl.objectives.metra import METRALoss
 from torchrl_etl.objectives.sac import LeanSACLoss
@@ -16,4 +17,6 @@ __all__ = [
     "LeanSACLoss",
     "METRALoss",
     "SynergySACLoss",
+    "entropy_target",
+    "make_sac_loss",
 ]

@@ -24,15 +24,17 @@ from torchrl_etl.checks import check_choice, check_flag, check_integer, naming
 from torchrl_etl.collectors import VectorCollector
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.extras import extra
-from torchrl_etl.learners import NORMALIZED, SACLearner, entropy_target
+from torchrl_etl.learners import NORMALIZED, SACLearner
 from torchrl_etl.modules import (
     HeldNoise,
+    ReturnScale,
     RunningNorm,
     SynergyMap,
     UniformWarmup,
     make_actor,
     make_critic,
 )
+from torchrl_etl.objectives import LeanSACLoss, entropy_target, make_sac_loss
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
@@ -132,6 +134,40 @@ class Context:
             check_choice("kind", kind := noise.pop("kind"), ("independent", "held"))
             return HeldNoise(actor, **noise) if kind == "held" else actor
 
+    def loss(
+        self,
+        actor: Actor,
+        section: str = "learn",
+        *,
+        spec: EnvironmentSpec | None = None,
+        decoder: SynergyMap | None = None,
+        inputs: Mapping[str, int] | None = None,
+        entropy_spec: Bounded | None = None,
+        **options: Any,
+    ) -> LeanSACLoss:
+        """Build critics and the SAC loss that ``section`` configures.
+
+        Keyword Args:
+            spec, decoder, inputs: those of the actor.
+            entropy_spec (Bounded, optional): spec of the outputs whose entropy has a target.
+                Default: all outputs of the actor.
+            **options: arguments of :func:`~torchrl_etl.objectives.make_sac_loss` besides the
+                configured ones.
+        """
+        spec, configured = spec or self.spec, self.options(section)
+        sizes = {**self._inputs(section, spec, inputs), "action": spec.action_dim}
+        with naming(f"{section}.critic"):
+            critic = make_critic(sizes, **configured["critic"]).to(self.device)
+        output = actor.spec[actor.dist_sample_keys[0]]
+        measured = output if entropy_spec is None else entropy_spec
+        others = {*signature(SACLearner).parameters, "normalize_observations"}
+        sac = {key: value for key, value in configured["sac"].items() if key not in others}
+        with naming(f"{section}.sac"):
+            entropy = entropy_target(measured, sac.pop("action_std"))
+            sac |= {"action_spec": output, "target_entropy": entropy, **options}
+            bins = configured["critic"].get("bins", 1)
+            return make_sac_loss(actor, critic, decoder, bins=bins, **sac)
+
     def learner(
         self,
         actor: Actor | None = None,
@@ -139,55 +175,44 @@ class Context:
         *,
         spec: EnvironmentSpec | None = None,
         decoder: SynergyMap | None = None,
-        inputs: Mapping[str, int] | None = None,
+        loss: LeanSACLoss | None = None,
         behavior: TensorDictModuleBase | None = None,
-        entropy_spec: Bounded | None = None,
         **parts: Any,
     ) -> SACLearner:
-        """Build critics and the learner that ``section`` configures.
+        """Build the learner that ``section`` configures.
 
         Args:
             actor (ProbabilisticTensorDictSequential, optional): Default: :meth:`actor`.
             section (str): ``"explore"`` or ``"learn"``.
 
         Keyword Args:
-            spec, decoder, inputs: those of the actor.
+            spec, decoder: those of the actor.
+            loss (LeanSACLoss, optional): SAC's losses. Default: :meth:`loss`.
             behavior (TensorDictModuleBase, optional): policy that collects, after
                 ``init_random_frames`` of uniform actions. Default: :meth:`behavior`.
-            entropy_spec (Bounded, optional): spec of the outputs whose entropy has a target.
-                Default: all outputs of the actor.
             **parts: arguments of :class:`~torchrl_etl.learners.SACLearner` besides the configured
                 ones, such as ``terms``.
         """
-        spec, options = spec or self.spec, self.options(section)
+        spec, sac = spec or self.spec, self.options(section)["sac"]
         if actor is None:
-            actor = self.actor(section, spec=spec, decoder=decoder, inputs=inputs)
+            actor = self.actor(section, spec=spec, decoder=decoder)
         if behavior is None:
             behavior = self.behavior(actor, section)
-        output = actor.spec[out_key := actor.dist_sample_keys[0]]
         if uniform := self._uniform_actions(section):
-            warmup = UniformWarmup(output, uniform, action_key=out_key)
+            (out_key,) = actor.dist_sample_keys
+            warmup = UniformWarmup(actor.spec[out_key], uniform, action_key=out_key)
             behavior = TensorDictSequential(behavior, warmup)
-        sizes = self._inputs(section, spec, inputs)
-        with naming(f"{section}.critic"):
-            critic = make_critic({**sizes, "action": spec.action_dim}, **options["critic"])
-        normalizer = RunningNorm(spec.observation_dim) if NORMALIZED in sizes else None
-        sac = options["sac"] | {"compile": self._compiles(section)}
-        del sac["normalize_observations"]  # read by self._inputs
+        if loss is None:
+            loss = self.loss(actor, section, spec=spec, decoder=decoder)
+        if sac["normalize_observations"]:
+            parts["normalizer"] = RunningNorm(spec.observation_dim)
+        if (bound := sac.get("return_bound")) is not None:
+            parts["return_scale"] = ReturnScale(sac["gamma"], bound=bound)
+        takes = signature(SACLearner).parameters  # the section also configures the loss
+        parts |= {key: value for key, value in sac.items() if key in takes}
+        parts["compile"] = self._compiles(section)
         with naming(f"{section}.sac"):
-            entropy_spec = output if entropy_spec is None else entropy_spec
-            return SACLearner(
-                actor,
-                critic.to(self.device),
-                action_spec=output,
-                decoder=decoder,
-                behavior=behavior,
-                normalizer=normalizer,
-                target_entropy=entropy_target(entropy_spec, sac.pop("action_std")),
-                bins=options["critic"].get("bins", 1),
-                **sac,
-                **parts,
-            )
+            return SACLearner(actor, loss, decoder=decoder, behavior=behavior, **parts)
 
     def _inputs(
         self, section: str, spec: EnvironmentSpec, others: Mapping[str, int] | None
@@ -263,6 +288,7 @@ class Context:
             "name": section,
             "updated": learner,
             "seed": stage_seed(self.config.seed, section),
+            "gamma": self.config[section].sac.gamma,
             "device": self.device,
             "action_repeat": self.config.action_repeat,
             "restart_seed": self.config.restart_seed,

@@ -83,6 +83,7 @@ class Stage:
         reward_scale (float): factor on the task's reward for learning; logged returns are unscaled.
         n_steps (int): rewards in a critic's target before it bootstraps, fewer at the end of an
             episode. Intermediate steps get no entropy bonus. Default: 1.
+        gamma (float): discount factor of these rewards.
         keep (sequence of NestedKey): additional entries of a transition to store.
         transforms (sequence of Transform): applied to rows sampled for many updates at once;
             transforms that depend on current weights belong to the learner instead.
@@ -113,6 +114,7 @@ class Stage:
         replay_ratio: float,
         learning_starts: int,
         reward_scale: float,
+        gamma: float,
         n_steps: int = 1,
         keep: Sequence[NestedKey] = (),
         transforms: Sequence[Transform] = (),
@@ -145,7 +147,7 @@ class Stage:
         self._kept = [*TRANSITION, *keep]
         self.multi_step = None
         if n_steps > 1:
-            self.multi_step = ContinuedMultiStep(learner.gamma, n_steps)
+            self.multi_step = ContinuedMultiStep(gamma, n_steps)
             self._kept.append("steps_to_next_obs")
 
     @property
