@@ -223,7 +223,7 @@ def test_eme_state_dict_holds_the_scale_of_its_bonus(tmp_path):
     stage = Experiment(tiny("method=eme", f"run_dir='{tmp_path}/run'")).method.stage()
     (bonus,) = stage.learner.objective.transforms
     assert bonus.deviation is not None
-    assert "transforms.0.deviation.mean" in stage.learner.parts["objective"].state_dict()
+    assert "transforms.0.deviation.mean" in stage.learner.components["objective"].state_dict()
 
 
 @pytest.mark.parametrize(

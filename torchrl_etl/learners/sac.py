@@ -181,7 +181,7 @@ class SACLearner:
         twin.objective = self.objective.only(*terms)
         twin.statistics = {}
         twin.targets = [term.target for term in terms if term.target is not None]
-        twin.ema = WarmedUpEMA(nn.Module(), 0.0)
+        twin.ema = WarmedUpEMA(nn.Module(), 0.0)  # of nothing: the actor stays
         twin._stepped = list(twin.objective.terms.parameters())
         twin._draw = redrawn(twin.loss)
         twin._compile(twin.gradients)
@@ -246,7 +246,7 @@ class SACLearner:
         self._step = cuda_graph(self.step) if graphed else self.step
 
     @property
-    def parts(self) -> dict[str, Any]:
+    def components(self) -> dict[str, Any]:
         """Components of a checkpoint; a trained learner acts by ``policy`` alone."""
         return {
             "policy": self.policy,

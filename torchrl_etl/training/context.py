@@ -177,7 +177,7 @@ class Context:
         decoder: SynergyMap | None = None,
         loss: LeanSACLoss | None = None,
         behavior: TensorDictModuleBase | None = None,
-        **parts: Any,
+        **options: Any,
     ) -> SACLearner:
         """Build the learner that ``section`` configures.
 
@@ -190,7 +190,7 @@ class Context:
             loss (LeanSACLoss, optional): SAC's losses. Default: :meth:`loss`.
             behavior (TensorDictModuleBase, optional): policy that collects, after
                 ``init_random_frames`` of uniform actions. Default: :meth:`behavior`.
-            **parts: arguments of :class:`~torchrl_etl.learners.SACLearner` besides the configured
+            **options: arguments of :class:`~torchrl_etl.learners.SACLearner` besides the configured
                 ones, such as ``terms``.
         """
         spec, sac = spec or self.spec, self.options(section)["sac"]
@@ -205,14 +205,14 @@ class Context:
         if loss is None:
             loss = self.loss(actor, section, spec=spec, decoder=decoder)
         if sac["normalize_observations"]:
-            parts["normalizer"] = RunningNorm(spec.observation_dim)
+            options["normalizer"] = RunningNorm(spec.observation_dim)
         if (bound := sac.get("return_bound")) is not None:
-            parts["return_scale"] = ReturnScale(sac["gamma"], bound=bound)
+            options["return_scale"] = ReturnScale(sac["gamma"], bound=bound)
         takes = signature(SACLearner).parameters  # the section also configures the loss
-        parts |= {key: value for key, value in sac.items() if key in takes}
-        parts["compile"] = self._compiles(section)
+        options |= {key: value for key, value in sac.items() if key in takes}
+        options["compile"] = self._compiles(section)
         with naming(f"{section}.sac"):
-            return SACLearner(actor, loss, decoder=decoder, behavior=behavior, **parts)
+            return SACLearner(actor, loss, decoder=decoder, behavior=behavior, **options)
 
     def _inputs(
         self, section: str, spec: EnvironmentSpec, others: Mapping[str, int] | None

@@ -196,7 +196,7 @@ class Stage:
 
     def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[PendingUpdates]:
         """Yield ``count`` updates on sampled batches, a few at a time, for the stage ``name``."""
-        for few in parts(count, AT_ONCE[self.device.type]):
+        for few in split(count, AT_ONCE[self.device.type]):
             yield PendingUpdates(name, learner, learner.inputs(self.samples(few)))
 
     def samples(self, count: int) -> TensorDictBase:
@@ -284,9 +284,9 @@ class Stage:
 
     def checkpoint(self) -> Checkpoint:
         """Everything that a resume needs, as a TorchRL checkpoint."""
-        parts = {**self.learner.parts, "progress": self.progress, "rng": GlobalRNGState()}
-        parts["transforms"] = self.transforms
-        return Checkpoint(**parts).register("buffer", self.buffer, adapter=BufferAdapter())
+        own = {"progress": self.progress, "rng": GlobalRNGState(), "transforms": self.transforms}
+        whole = Checkpoint(**self.learner.components, **own)
+        return whole.register("buffer", self.buffer, adapter=BufferAdapter())
 
     def close(self) -> None:
         self._close_batches()
@@ -314,11 +314,11 @@ def check_budget(frames: int, replay_ratio: float) -> None:
     check_real("(0, 1000]", replay_ratio=replay_ratio)
 
 
-def parts(total: int, most: int) -> list[int]:
+def split(total: int, most: int) -> list[int]:
     """Split ``total`` into parts of at most ``most``.
 
     Examples:
-        >>> parts(40, 16)
+        >>> split(40, 16)
         [16, 16, 8]
     """
     return [min(most, total - done) for done in range(0, total, most)]
