@@ -19,7 +19,7 @@ from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_folder, validate
-from torchrl_etl.training.config import RENAMED, quoted, resume_setting, split_seeds
+from torchrl_etl.training.config import REMOVED, RENAMED, quoted, resume_setting, split_seeds
 from torchrl_etl.training.resumed import parse_override
 from torchrl_etl.training.run_folder import RunFolder
 
@@ -58,8 +58,6 @@ def test_every_task_of_the_paper_is_valid(task):
         ("seed=0.5", "seed is 0.5"),
         ("collector.frames_per_batch=33", "it must be a multiple of their number"),
         ("checkpoint.keep=1", "checkpoint.keep is 1; it must be a whole number, 2 or more"),
-        ("explore.fit.best_share=0", "explore.fit.best_share is 0; it must be a number in (0, 1]"),
-        ("explore.fit.best_share=0.5", "use actions=mean"),
         ("exploration.relabel=2", "exploration.relabel is 2; it must be a number in [0, 1]"),
         ("explore.fit.actions=loc", "policy, mean, sampled, activation"),
         ("learn.decoder.fine_tuning=freeze", "nearest: frozen"),
@@ -281,9 +279,10 @@ def test_renamed_setting_is_refused_with_its_new_name(argument, words):
         translate([argument], CONF)
 
 
-def test_removed_setting_is_refused():
-    with pytest.raises(ValueError, match=r"learn\.sac\.unit_rows was removed, .* leave it out\."):
-        translate(["learn.sac.unit_rows=true"], CONF)
+@pytest.mark.parametrize("key", REMOVED)
+def test_removed_setting_is_refused(key):
+    with pytest.raises(ValueError, match=f"{re.escape(key)} was removed, .* leave it out"):
+        translate([f"{key}=0.25"], CONF)
 
 
 def test_misspelled_kind_of_synergies_is_refused_with_the_nearest():

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from tests.configs import tiny
 from torchrl_etl.training import resumed_config, validate
+from torchrl_etl.training.config import REMOVED
 
 
 @pytest.fixture
@@ -63,13 +64,15 @@ def test_config_with_former_setting_names_is_refused(file):
         resumed_config(file.parent, defaults=tiny())
 
 
-def test_config_with_a_removed_setting_resumes_only_at_its_default(file):
-    changed(file, learn__sac__unit_rows=False)
+@pytest.mark.parametrize("key", REMOVED)
+def test_config_with_a_removed_setting_resumes_only_at_its_default(key, file):
+    name = key.replace(".", "__")
+    changed(file, **{name: REMOVED[key]})
     assert resumed_config(file.parent, defaults=tiny()) == tiny(
         f"run_dir='{file.parent}'", "frames=1000"
     )
-    changed(file, learn__sac__unit_rows=True)
-    with pytest.raises(ValueError, match=r"has learn\.sac\.unit_rows=True, which was removed"):
+    changed(file, **{name: 0.25})
+    with pytest.raises(ValueError, match=rf"has {re.escape(key)}=0\.25, which was removed"):
         resumed_config(file.parent, defaults=tiny())
 
 

@@ -215,20 +215,6 @@ def test_relabel_draws_directions_that_were_not_followed():
     stage.close()
 
 
-def test_best_share_keeps_the_highest_rewards():
-    found = explorer("explore.fit.best_share=0.25", "explore.fit.actions=mean")
-    stage = found.stage
-    fill(stage)
-    batch = stage.sample()
-    best = found.selector(batch)["action"]
-    reward = batch["next", "reward"].squeeze(-1)
-    threshold = reward.sort(descending=True).values[7]
-    assert best.shape[0] == 8
-    allowed = batch["loc"].tanh()[reward >= threshold]
-    assert all(torch.isclose(row, allowed).all(-1).any() for row in best)
-    stage.close()
-
-
 def test_buffer_keeps_executed_pairs_while_the_decoder_changes():
     stage = learn_stage()
     expected = []

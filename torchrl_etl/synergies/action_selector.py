@@ -11,7 +11,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_etl.checks import check_choice, check_real
+from torchrl_etl.checks import check_choice
 
 __all__ = ["ActionSelector"]
 
@@ -32,24 +32,13 @@ class ActionSelector:
         actions (str): ``"policy"``: mean actions of the current policy; ``"mean"``: mean actions of
             the policy that collected them; ``"sampled"``: executed actions; ``"activation"``:
             muscle activations in action units.
-        best_share (float): fraction of a batch to select, by highest reward. Default: 1.
     """
 
     def __init__(
-        self,
-        actor: ProbabilisticTensorDictSequential,
-        *,
-        actions: Actions = "policy",
-        best_share: float = 1.0,
+        self, actor: ProbabilisticTensorDictSequential, *, actions: Actions = "policy"
     ) -> None:
         check_choice("actions", actions, get_args(Actions))
-        check_real("(0, 1]", best_share=best_share)
-        if best_share < 1 and actions == "policy":
-            raise ValueError(
-                f"best_share is {best_share} and selects by reward, but actions=policy uses fresh "
-                "actions, which have no recorded reward; use actions=mean."
-            )
-        self.actor, self.actions, self.best_share = actor, actions, best_share
+        self.actor, self.actions = actor, actions
 
     @property
     def keep(self) -> Sequence[NestedKey]:
@@ -62,9 +51,6 @@ class ActionSelector:
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """A tensordict with the selected ``action`` [*, n]."""
         actions = self._of(batch)
-        if self.best_share < 1:
-            count = max(1, round(self.best_share * len(actions)))
-            actions = actions[batch["next", "reward"].squeeze(-1).topk(count).indices]
         return TensorDict({"action": actions}, actions.shape[:1])
 
     def _of(self, batch: TensorDictBase) -> Tensor:

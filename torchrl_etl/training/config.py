@@ -72,7 +72,7 @@ RENAMED = {
 }
 """Former names of settings, with their current names."""
 
-REMOVED = {"learn.sac.unit_rows": False}
+REMOVED = {"explore.fit.best_share": 1.0, "learn.sac.unit_rows": False}
 """Former settings, each with its default: runs that had it go on without the setting."""
 
 OPEN_SECTIONS = ("env_kwargs", "logger_kwargs", "ray", "distributed")
