@@ -140,7 +140,7 @@ class Experiment:
         )
 
     def _learn(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
-        stage, charged = self.method.stage(), self.method.charged_frames
+        stage, charged = self.method.stage(), self.method.frames_before()
         self.method.begin(stage)
         evaluator = self.evaluator(stage)
         last = yield from self.context.run_stage(

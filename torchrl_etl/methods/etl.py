@@ -165,8 +165,6 @@ class ETL(Method):
         if not self.given and not surviving_folder(self.context.folder.synergies).exists():
             yield from self._explore(stop)
         _, info = self._load()
-        if not self.given:  # whole batches may exceed the budget by a few frames
-            self.charged_frames = info.facts["frames"]
         return {"synergies": {"task": info.task, **info.facts}}
 
     def _explore(self, stop: StopOnSignal) -> Work[None]:
@@ -245,6 +243,7 @@ class ETL(Method):
     def frames_before(self) -> int:
         own = self.context.folder.synergies
         if not self.given and surviving_folder(own).exists():
+            # Whole batches may exceed the budget of stage 1 by a few frames.
             return self._load()[1].facts["frames"]
         return super().frames_before()
 

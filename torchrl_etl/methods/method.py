@@ -26,7 +26,7 @@ class Method(ABC):
         context (Context): configuration, folder and environment of the run.
 
     Attributes:
-        charged_frames (int): frames that :meth:`prepare` uses; they count toward the budget.
+        charged_frames (int): frames that :meth:`prepare` plans to use, which divide the budget.
         has_synergies (bool): whether ``stage`` and ``synergies`` may be set.
         takes (tuple of str): names of the method's own options.
         fixed_settings (tuple): settings with only one valid value, each as (key, value, reason).
@@ -79,7 +79,7 @@ class Method(ABC):
 
         Results that exist already are reused. Returns facts for ``summary.json``.
         """
-        yield from ()
+        yield from ()  # a generator, see Work; this one never pauses
         return {}
 
     @abstractmethod
