@@ -151,8 +151,8 @@ class Context:
             spec, decoder, inputs: those of the actor.
             entropy_spec (Bounded, optional): spec of the outputs whose entropy has a target.
                 Default: all outputs of the actor.
-            **options: arguments of :func:`~torchrl_etl.objectives.make_sac_loss` besides the
-                configured ones.
+            **options: override configured arguments of
+                :func:`~torchrl_etl.objectives.make_sac_loss`.
         """
         spec, configured = spec or self.spec, self.options(section)
         sizes = {**self._inputs(section, spec, inputs), "action": spec.action_dim}
@@ -164,9 +164,9 @@ class Context:
         sac = {key: value for key, value in configured["sac"].items() if key not in others}
         with naming(f"{section}.sac"):
             entropy = entropy_target(measured, sac.pop("action_std"))
-            sac |= {"action_spec": output, "target_entropy": entropy, **options}
-            bins = configured["critic"].get("bins", 1)
-            return make_sac_loss(actor, critic, decoder, bins=bins, **sac)
+            sac |= {"action_spec": output, "target_entropy": entropy}
+            sac["bins"] = configured["critic"].get("bins", 1)
+            return make_sac_loss(actor, critic, decoder, **{**sac, **options})
 
     def learner(
         self,
@@ -190,8 +190,8 @@ class Context:
             loss (LeanSACLoss, optional): SAC's losses. Default: :meth:`loss`.
             behavior (TensorDictModuleBase, optional): policy that collects, after
                 ``init_random_frames`` of uniform actions. Default: :meth:`behavior`.
-            **options: arguments of :class:`~torchrl_etl.learners.SACLearner` besides the configured
-                ones, such as ``terms``.
+            **options: override configured arguments of
+                :class:`~torchrl_etl.learners.SACLearner`, or add others, such as ``terms``.
         """
         spec, sac = spec or self.spec, self.options(section)["sac"]
         if actor is None:
@@ -204,15 +204,16 @@ class Context:
             behavior = TensorDictSequential(behavior, warmup)
         if loss is None:
             loss = self.loss(actor, section, spec=spec, decoder=decoder)
-        if sac["normalize_observations"]:
-            options["normalizer"] = RunningNorm(spec.observation_dim)
-        if (bound := sac.get("return_bound")) is not None:
-            options["return_scale"] = ReturnScale(sac["gamma"], bound=bound)
         takes = signature(SACLearner).parameters  # the section also configures the loss
-        options |= {key: value for key, value in sac.items() if key in takes}
-        options["compile"] = self._compiles(section)
+        configured = {key: value for key, value in sac.items() if key in takes}
+        configured["compile"] = self._compiles(section)
+        if sac["normalize_observations"]:
+            configured["normalizer"] = RunningNorm(spec.observation_dim)
+        if (bound := sac.get("return_bound")) is not None:
+            configured["return_scale"] = ReturnScale(sac["gamma"], bound=bound)
+        configured |= options
         with naming(f"{section}.sac"):
-            return SACLearner(actor, loss, decoder=decoder, behavior=behavior, **options)
+            return SACLearner(actor, loss, decoder=decoder, behavior=behavior, **configured)
 
     def _inputs(
         self, section: str, spec: EnvironmentSpec, others: Mapping[str, int] | None
