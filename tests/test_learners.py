@@ -16,7 +16,7 @@ from tests.stages import fill, learn_stage
 from torchrl_etl.learners import SACLearner, Term, WarmedUpEMA
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.modules import StateEncoder, make_actor, make_critic
-from torchrl_etl.objectives import BehavioralMetricLoss, make_sac_loss
+from torchrl_etl.objectives import BehavioralMetricLoss, LeanSACLoss, make_sac_loss
 
 RATES = (0.1, 0.03)
 
@@ -127,6 +127,15 @@ def test_updates_on_several_batches_equal_updates_in_turn():
     at_once.close(), in_turn.close()
 
 
+def transitions():
+    """A batch of transitions of three observations and two actions."""
+    end = torch.zeros(32, 1, dtype=torch.bool)
+    following = {"observation": torch.randn(32, 3), "reward": torch.randn(32, 1)}
+    following |= {"done": end, "terminated": end}
+    entries = {"observation": torch.randn(32, 3), "action": torch.zeros(32, 2)}
+    return TensorDict({**entries, "next": following}, [32])
+
+
 class Measures(Transform):
     """A reward computed with an encoder whose loss has a target network."""
 
@@ -152,9 +161,25 @@ def test_target_network_is_updated_when_a_transform_reads_the_loss():
     )
     assert not any("target" in name for name in learner.statistics)
     before = loss.target_encoder_params.clone()
-    end = torch.zeros(32, 1, dtype=torch.bool)
-    following = {"observation": torch.randn(32, 3), "reward": torch.randn(32, 1)}
-    following |= {"done": end, "terminated": end}
-    entries = {"observation": torch.randn(32, 3), "action": torch.zeros(32, 2)}
-    learner.update(TensorDict({**entries, "next": following}, [32]))
+    learner.update(transitions())
     assert (loss.target_encoder_params != before).any()
+
+
+class Doubled(LeanSACLoss):
+    """SAC with twice the actor loss."""
+
+    def actor_loss(self, tensordict):
+        loss, logged = super().actor_loss(tensordict)
+        return 2 * loss, logged
+
+
+def test_learner_minimizes_the_sac_loss_that_it_is_handed():
+    spec, batch, logs = Bounded(-1, 1, shape=(2,)), transitions(), []
+    for kind in (LeanSACLoss, Doubled):
+        torch.manual_seed(0)
+        actor = make_actor({"observation": 3}, spec)
+        critic = make_critic({"observation": 3, "action": 2})
+        logs.append(SACLearner(actor, kind(actor, critic, action_spec=spec)).update(batch))
+    plain, doubled = logs
+    assert doubled["loss_actor"] == 2 * plain["loss_actor"] != 0
+    assert doubled["loss_qvalue"] == plain["loss_qvalue"]
