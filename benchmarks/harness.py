@@ -25,7 +25,17 @@ __all__ = ["Child", "interleave", "line", "recipe", "spread", "synergy_policy", 
 
 CONF = Path(__file__).resolve().parent.parent / "recipes" / "conf"
 
-PLAIN = ("learner=plain", "num_synergies=4", "learn.decoder.residual=0")
+# The settings of the published lines, for which ``learner=plain`` alone stood then.
+PLAIN = (
+    "learner=plain",
+    "actor.layer_norm=true",
+    "learn.replay_ratio=0.25",
+    "learn.reward_scale=0.1",
+    "learn.sac.gamma=0.97",
+    "learn.sac.alpha_init=0.1",
+    "num_synergies=4",
+    "learn.decoder.residual=0",
+)
 
 
 def recipe(*overrides: str) -> DictConfig:
@@ -35,7 +45,9 @@ def recipe(*overrides: str) -> DictConfig:
 
 
 def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
-    """The learn stage's policy: an actor with two layers of 256, a decoder with two of 128."""
+    """The learn stage's policy under ``PLAIN``: an actor with two layers of 256 with layer norm, a
+    decoder with two of 128.
+    """
     env = make_env(task)
     bounds = env.full_action_spec_unbatched["action"]
     inputs = {"observation": env.observation_spec["observation"].shape[-1]}
@@ -43,7 +55,7 @@ def synergy_policy(task: str, num_synergies: int) -> TensorDictSequential:
     decoder = SynergyDecoder(
         num_synergies, bounds.shape[-1], low=bounds.space.low, high=bounds.space.high
     )
-    actor = make_actor(inputs, decoder.synergy_spec, out_key="synergy")
+    actor = make_actor(inputs, decoder.synergy_spec, out_key="synergy", layer_norm=True)
     return TensorDictSequential(actor, decoder)
 
 

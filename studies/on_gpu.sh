@@ -3,7 +3,8 @@
 #
 #     sh studies/on_gpu.sh [FRAMES]      default: 1000000
 #     TASKS=[myoHandKeyTurn] METHODS=[sac,dynsyn] SEEDS=[0,1,2,3] \
-#       MORE=learner=plain sh studies/on_gpu.sh 150000
+#       MORE="learner=plain learn.reward_scale=0.1 learn.sac.alpha_init=0.1" \
+#       sh studies/on_gpu.sh 150000
 #
 # All seeds of a task and method learn in one pass, each with its simulators in a process of its own;
 # with JOBS=2 two such passes share the GPU. Rows go to OUT, docs/results/on_gpu by default. It may be
