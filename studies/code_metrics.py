@@ -11,6 +11,7 @@ Coincidental matches count, so the second number is an upper bound.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import re
 import runpy
@@ -96,12 +97,17 @@ def called(node: ast.Call) -> str:
 
 
 def main() -> None:
-    checkout, count, *overrides = sys.argv[1:]
-    checkout = Path(checkout).resolve()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkout", type=Path, help="folder that holds torchrl_etl")
+    parser.add_argument("metric", choices=("chain", "checks"))
+    parser.add_argument("overrides", nargs="*", help="settings of recipes/etl_sac.py, for chain")
+    arguments = parser.parse_args()
+    checkout = arguments.checkout.resolve()
     package = checkout / "torchrl_etl"
-    if count == "chain":
+    if arguments.metric == "chain":
         sys.path.insert(0, str(checkout))
-        chain = longest_chain(package, checkout / "recipes" / "etl_sac.py", overrides)
+        recipe = checkout / "recipes" / "etl_sac.py"
+        chain = longest_chain(package, recipe, arguments.overrides)
         print(*chain, f"{len(chain)} functions", sep="\n")
         return
     central = package / CENTRAL

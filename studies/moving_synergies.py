@@ -14,7 +14,7 @@ on TASK myoHandPose.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +33,14 @@ SECONDS = 2.0
 SIZE = (180, 212)  # pixels of a panel
 
 
-def main(bundle: str, folder: str, task: str | None = None) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("folder", type=Path, help="where the animation is written")
+    parser.add_argument("task", nargs="?", help="another task than the bundle's, of the same body")
+    arguments = parser.parse_args()
     with exit_on_error(ValueError, OSError, RuntimeError):
-        session = Session(open_bundle(Path(bundle), task))
+        session = Session(open_bundle(arguments.bundle, arguments.task))
         session.model.site_rgba[:, 3] = 0.0  # hide the goals of the task
         with EpisodeRecorder(session.env, size=SIZE) as recorder:
             number = min(SHOWN, len(session.coefficients))
@@ -43,7 +48,7 @@ def main(bundle: str, folder: str, task: str | None = None) -> None:
                 f"synergy {synergy + 1}": [moved(session, recorder, synergy)]
                 for synergy in range(number)
             }
-        for path in write_animation(Path(folder), sides, "moving_synergies"):
+        for path in write_animation(arguments.folder, sides, "moving_synergies"):
             print(path)
 
 
@@ -59,4 +64,4 @@ def moved(session: Session, recorder: EpisodeRecorder, synergy: int) -> np.ndarr
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
