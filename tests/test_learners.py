@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 from tests.stages import fill, learn_stage
 from torchrl_etl.learners import SACLearner, Term, WarmedUpEMA
 from torchrl_etl.learners.adam import GradientAdam
-from torchrl_etl.modules import StateEncoder, make_actor, make_critic
+from torchrl_etl.modules import StateEncoder, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import BehavioralMetricLoss, LeanSACLoss, make_sac_loss
 
 RATES = (0.1, 0.03)
@@ -183,3 +183,17 @@ def test_learner_minimizes_the_sac_loss_that_it_is_handed():
     plain, doubled = logs
     assert doubled["loss_actor"] == 2 * plain["loss_actor"] != 0
     assert doubled["loss_qvalue"] == plain["loss_qvalue"]
+
+
+def test_loss_of_another_actor_or_decoder_is_refused():
+    decoders = [SynergyDecoder(2, 4), SynergyDecoder(2, 4)]
+    spec = decoders[0].synergy_spec
+    actor, other = (make_actor({"observation": 3}, spec, out_key="synergy") for _ in range(2))
+    critic = make_critic({"observation": 3, "action": 4})
+    sac = make_sac_loss(actor, critic, decoders[0], action_spec=spec)
+    SACLearner(actor, sac, decoder=decoders[0])
+    with pytest.raises(ValueError, match="loss of another actor"):
+        SACLearner(other, sac, decoder=decoders[0])
+    for decoder in (None, decoders[1]):
+        with pytest.raises(ValueError, match="not a loss through this decoder"):
+            SACLearner(actor, sac, decoder=decoder)

@@ -15,9 +15,9 @@ from torchrl_etl.envs import SimulationError
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import StackedLearners
 from torchrl_etl.training import Interrupted, resumed_config, run_alone, run_interleaved
-from torchrl_etl.training.context import stage_seed
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import RunFolder
+from torchrl_etl.training.simulators import stage_seed
 from torchrl_etl.training.stage import Stage
 
 SHORT = ("frames=416", "explore.frames=224", "evaluation.episodes=1")

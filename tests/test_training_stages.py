@@ -64,13 +64,6 @@ def test_collection_restarts_after_a_failed_start(monkeypatch):
     stage.close()
 
 
-@pytest.mark.parametrize("ratio", [-1.0, math.nan, 1e9])
-def test_invalid_replay_ratio_is_refused(ratio, tmp_path):
-    context = Experiment(tiny("method=sac", f"run_dir='{tmp_path}/run'")).context
-    with pytest.raises(ValueError, match=r"learn\.replay_ratio is .*; it must be a number in"):
-        context.stage(context.learner(), replay_ratio=ratio)
-
-
 def test_learning_rate_of_null_is_that_of_the_learner():
     for stage in (
         explorer("exploration.lr=null", "synergies.lr=0.25", "explore.sac.lr=0.5").stage,

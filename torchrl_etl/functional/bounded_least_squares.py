@@ -28,7 +28,7 @@ def bounded_least_squares(weight: Tensor, target: Tensor) -> Tensor:
         >>> import torch
         >>> nearly_parallel = torch.tensor([[1.0, 1.0], [0.0, 0.01]])
         >>> bounded_least_squares(nearly_parallel, torch.tensor([0.5, 0.1]))
-        tensor([-0.4999,  1.0000])
+        tensor([-0.5000,  1.0000])
     """
     x = target @ weight.pinverse().mT
     outside = (x.abs() > 1).any(-1)

@@ -24,7 +24,7 @@ from torchrl_etl.learners.policy import from_observation
 from torchrl_etl.learners.term import Term
 from torchrl_etl.modules import ReturnScale, RunningNorm, Scheduled, SynergyMap
 from torchrl_etl.modules.return_scale import episode_numbers
-from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss
+from torchrl_etl.objectives import FusedSoftUpdate, LeanSACLoss, SynergySACLoss
 
 __all__ = ["Gradients", "SACLearner"]
 
@@ -62,7 +62,7 @@ class SACLearner:
         compile (bool): compile updates; on CUDA, also capture each as one CUDA graph.
 
     Raises:
-        ValueError: if a number is out of range.
+        ValueError: if a number is out of range, or ``sac`` is a loss of another actor or decoder.
 
     Examples:
         >>> import torch
@@ -106,6 +106,7 @@ class SACLearner:
         check_real("[0, 1]", lr_end=lr_end)
         check_real("(0, 1]", tau=tau)
         check_real("[0, 1)", ema_decay=ema_decay)
+        _check_networks(sac, actor, decoder)
         self.actor, self.decoder, self.device = actor, decoder, next(actor.parameters()).device
         self.lr_end, self.compile = lr_end, compile
         # The loss creates these lazily; they must exist before optimizer and compiled updates do.
@@ -254,3 +255,19 @@ class SACLearner:
             "ema": self.ema,
             "optimizer": self.optimizer,
         }
+
+
+def _check_networks(
+    sac: LeanSACLoss, actor: TensorDictModuleBase, decoder: SynergyMap | None
+) -> None:
+    """Raise ``ValueError`` unless the loss trains this actor, through this decoder if any."""
+    trained = {id(parameter) for parameter in sac.parameters()}
+    if not trained.issuperset(map(id, actor.parameters())):
+        raise ValueError("sac is the loss of another actor; pass make_sac_loss(actor, ...).")
+    through = () if decoder is None else decoder.parameters()
+    decodes = isinstance(sac, SynergySACLoss)
+    if decodes != (decoder is not None) or not trained.issuperset(map(id, through)):
+        raise ValueError(
+            "sac is not a loss through this decoder; pass the same decoder to make_sac_loss and "
+            "to the learner, or to neither."
+        )

@@ -57,7 +57,7 @@ class Explorer:
         with naming("explore.fit"):
             self.selector = ActionSelector(actor, **fit)
         with naming("exploration"):
-            terms = self.exploration.terms()
+            terms = [*self.exploration.terms()]
         fitted = []
         if self.model.loss is not None:
             with naming("synergies"):

@@ -126,6 +126,7 @@ def validate(config: DictConfig) -> None:
     key = config.success_key
     if key is not None and (not isinstance(key, str) or not key):
         raise ValueError(f"success_key is {key!r}; it must name an entry of info, or be null.")
+    _check_names(config)
     _check_values(config)
     check_choice("stage", config.stage, ("explore", "learn", "all"))
     check_choice("collector.kind", config.collector.kind, COLLECTORS)
@@ -133,6 +134,17 @@ def validate(config: DictConfig) -> None:
     _check_collector(config.collector)
     _check_loggers(config.log)
     check_device(config.device)
+
+
+def _check_names(config: DictConfig) -> None:
+    """Refuse former settings, which a YAML file of the user's own may still have."""
+    with extra("recipes"):
+        from omegaconf import OmegaConf
+    for old in (*RENAMED, *REMOVED):
+        section, _, name = old.rpartition(".")
+        if name in (OmegaConf.select(config, section) or {}):
+            now = f"is called {RENAMED[old]} now" if old in RENAMED else "was removed"
+            raise ValueError(f"{old} {now}; change the file that sets it.")
 
 
 def _check_values(config: DictConfig) -> None:

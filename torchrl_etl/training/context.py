@@ -17,7 +17,7 @@ from tensordict.nn import (
 )
 from torchrl.collectors import Collector
 from torchrl.data import Bounded
-from torchrl.envs import Compose, EnvBase, InitTracker, RewardSum, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_choice, check_flag, check_integer, naming
@@ -38,6 +38,7 @@ from torchrl_etl.objectives import LeanSACLoss, entropy_target, make_sac_loss
 from torchrl_etl.training.evaluation import Evaluation
 from torchrl_etl.training.loop import StopOnSignal, run_stage
 from torchrl_etl.training.run_folder import RunFolder
+from torchrl_etl.training.simulators import env_of_a_collector, stage_seed
 from torchrl_etl.training.stage import Stage, check_budget, frames_per_action
 from torchrl_etl.training.work import Work
 
@@ -47,6 +48,12 @@ if TYPE_CHECKING:
 __all__ = ["Context"]
 
 Actor: TypeAlias = ProbabilisticTensorDictSequential
+
+OF_LEARNER_OR_METHOD = (
+    *("actor", "critic", "sac", "noise", "init_random_frames"),
+    *("decoder", "prefill", "fit"),
+)
+"""Settings of the sections ``explore`` and ``learn`` that :meth:`Context.stage` leaves out."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +124,7 @@ class Context:
             decoder (SynergyMap, optional): maps its outputs to actions. Default: they are actions.
             inputs (mapping, optional): sizes of its inputs besides the observation, by key.
             make (callable): builds it. Default: :func:`~torchrl_etl.modules.make_actor`.
-            **options: arguments of ``make`` besides the configured ones.
+            **options: override configured arguments of ``make``, or add others.
         """
         spec = spec or self.spec
         output, out_key = spec.action_spec, "action"
@@ -125,7 +132,8 @@ class Context:
             output, out_key = decoder.to(self.device).synergy_spec, decoder.in_keys[0]
         sizes, configured = self._inputs(section, spec, inputs), self.options(section)["actor"]
         with naming(f"{section}.actor"):
-            return make(sizes, output, out_key=out_key, **configured, **options).to(self.device)
+            configured |= {"out_key": out_key, **options}
+            return make(sizes, output, **configured).to(self.device)
 
     def behavior(self, actor: Actor, section: str = "learn") -> TensorDictModuleBase:
         """The actor with exploration noise, drawn at every step or held for several."""
@@ -147,15 +155,33 @@ class Context:
     ) -> LeanSACLoss:
         """Build critics and the SAC loss that ``section`` configures.
 
+        Args:
+            actor (ProbabilisticTensorDictSequential): see :meth:`actor`.
+            section (str): ``"explore"`` or ``"learn"``.
+
         Keyword Args:
             spec, decoder, inputs: those of the actor.
             entropy_spec (Bounded, optional): spec of the outputs whose entropy has a target.
                 Default: all outputs of the actor.
             **options: override configured arguments of
                 :func:`~torchrl_etl.objectives.make_sac_loss`.
+
+        Raises:
+            ValueError: if the actor has other inputs, or ``gamma`` or ``return_bound`` is given.
         """
         spec, configured = spec or self.spec, self.options(section)
-        sizes = {**self._inputs(section, spec, inputs), "action": spec.action_dim}
+        if shared := sorted({"gamma", "return_bound"} & {*options}):
+            raise ValueError(
+                f"{shared[0]} cannot be set here, as n-step targets or the scale of returns use it "
+                f"too; change the setting {section}.sac.{shared[0]}."
+            )
+        sizes = self._inputs(section, spec, inputs)
+        if {*sizes} != {*actor.in_keys}:
+            raise ValueError(
+                f"The actor reads {sorted(actor.in_keys)} but its critics would read "
+                f"{sorted(sizes)}; pass loss(..., inputs=) what actor(..., inputs=) got."
+            )
+        sizes["action"] = spec.action_dim
         with naming(f"{section}.critic"):
             critic = make_critic(sizes, **configured["critic"]).to(self.device)
         output = actor.spec[actor.dist_sample_keys[0]]
@@ -265,14 +291,15 @@ class Context:
         """
         collector = self.options("collector")
         num_envs = collector.pop("num_envs")
+        fast = num_envs > 1
         slow = [type(each).__name__ for each in env_transforms if not VectorCollector.takes(each)]
-        if num_envs > 1 and slow:
+        if fast and slow:
+            fast = False
             warnings.warn(
                 "Frames are collected with TorchRL's Collector, which is several times slower, "
                 f"since {', '.join(slow)} has no array_step and array_reset (see VectorCollector).",
                 stacklevel=2,
             )
-        fast = num_envs > 1 and not slow
         collector["collector_class"] = VectorCollector if fast else Collector
         collector |= {engine: self.options(engine) for engine in ("ray", "distributed")}
         other = {"goal": None, "success_key": None} if task else {}  # implied by the task
@@ -283,8 +310,9 @@ class Context:
             transforms=tuple(env_transforms),
             **{**self.task_options, **other, **(env_options or {})},
         )
-        takes = signature(Stage).parameters  # the section also configures learner and method
-        configured = {k: v for k, v in self.options(section).items() if k in takes}
+        configured = self.options(section)
+        for key in OF_LEARNER_OR_METHOD:
+            configured.pop(key, None)
         fixed = {
             "name": section,
             "updated": learner,
@@ -318,16 +346,3 @@ class Context:
     def seed_everything(self, section: str) -> None:
         """Seed PyTorch for what ``section`` builds."""
         torch.manual_seed(stage_seed(self.config.seed, section))
-
-
-def stage_seed(seed: int, section: str) -> int:
-    """Seed of a stage: even for ``"explore"``, odd for ``"learn"``."""
-    return 2 * seed + (section != "explore")
-
-
-def env_of_a_collector(name: str, transforms: Sequence[Transform], **kwargs: Any) -> TransformedEnv:
-    """Build simulators with the transforms that loop and stage need; picklable for workers."""
-    own = [transform.clone() for transform in transforms]
-    return TransformedEnv(
-        make_env(name, **kwargs, device="cpu"), Compose(RewardSum(), InitTracker(), *own)
-    )
