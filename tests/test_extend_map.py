@@ -21,9 +21,9 @@ from torchrl_etl.training import resumed_config
 class Clamped(SynergyMap):
     """a = z·basis + ρ·r, clamped to the bounds."""
 
-    def __init__(self, num_synergies, action_dim, *, low, high, residual=0.0, **keys):
-        keys = {"in_keys": ["synergy"], "out_keys": ["action"]} | keys
-        super().__init__(Mix(num_synergies, low, high, residual), **keys)
+    def __init__(self, num_synergies, action_dim, *, low, high, residual=0.0):
+        mix = Mix(num_synergies, low, high, residual)
+        super().__init__(mix, in_keys=["synergy"], out_keys=["action"])
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
 
     @property
@@ -61,6 +61,13 @@ class WithMap(PCASynergies):
 class FixedResidual(PCASynergies):
     def decoder(self, actions, *, residual=0.0):
         return SARDecoder.from_basis(actions.mean(0), self.basis, low=self.low, high=self.high)
+
+
+class WeightNotInConfig(WithMap):
+    def decoder(self, actions, *, residual=0.0):
+        made = super().decoder(actions, residual=residual)
+        made.register_buffer("usual", actions.mean(0))
+        return made
 
 
 class NoMap(PCASynergies):
@@ -103,6 +110,7 @@ def test_run_imports_the_module_of_its_own_map_and_a_bundle_does_not(tmp_path, m
     ("kind", "words"),
     [
         ("FixedResidual", "is a SARDecoder, whose residual is fixed at 0.34"),
+        ("WeightNotInConfig", r"do not make a decoder: (.|\n)*Unexpected key.*usual"),
         ("NoMap", "is a Linear; it must be a SynergyMap"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 import safetensors.torch
@@ -18,7 +19,7 @@ from torchrl_etl.io import surviving_folder, write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.explorer import Explorer, make_synergy_model
 from torchrl_etl.methods.method import Method
-from torchrl_etl.modules import SynergyDecoder, SynergyMap, describe_map, make_map
+from torchrl_etl.modules import SynergyDecoder, SynergyMap
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import (
     BundleInfo,
@@ -135,12 +136,13 @@ class ETL(Method):
         self.stage()
 
     def _try_out(self, model: SynergyModel) -> None:
-        """Refuse a model whose decoder stage 2 cannot load, before stage 1 takes hours."""
+        """Refuse a model whose bundle stage 2 cannot load, before stage 1 takes hours."""
         actions = self.context.spec.action_spec.rand((256,))
         if model.loss is None:
             model.fit(actions)
-        described = describe_map(model.decoder(actions))
-        make_map(described, residual=self.context.config.learn.decoder.residual)
+        with TemporaryDirectory(prefix="try-out-") as folder:
+            model.save(folder, actions, task="try-out", actuators=self.context.spec.actuators)
+            load_bundle(folder, residual=self.context.config.learn.decoder.residual)
 
     # Stage 1 -----------------------------------------------------------------------------------
 

@@ -135,8 +135,8 @@ def load_bundle(
     path: str | os.PathLike[str],
     *,
     residual: float | None = None,
-    in_keys: Sequence[NestedKey] = ("synergy",),
-    out_keys: Sequence[NestedKey] = ("action",),
+    in_keys: Sequence[NestedKey] | None = None,
+    out_keys: Sequence[NestedKey] | None = None,
 ) -> tuple[SynergyMap, BundleInfo]:
     """Read a bundle from its folder, or from a run folder with a subfolder ``synergies/``.
 
@@ -148,7 +148,8 @@ def load_bundle(
 
     Keyword Args:
         residual (float, optional): replaces the bundle's residual share; it has no weights.
-        in_keys, out_keys (sequence of NestedKey): see :class:`~torchrl_etl.modules.SynergyDecoder`.
+        in_keys, out_keys (sequence of NestedKey, optional): replace those of the map, if its
+            constructor takes them. Default: its own.
 
     Returns:
         tuple of SynergyMap and BundleInfo: the decoder on the CPU, and its description.
@@ -183,10 +184,12 @@ def load_bundle(
             "it was saved; explore again, or take another bundle."
         )
     described = {"kind": _DEFAULT_MAP, **info.config}
+    keys = {"in_keys": in_keys, "out_keys": out_keys}
+    given = {name: value for name, value in keys.items() if value is not None}
     try:
         # Initial weights are overwritten at once, so drawing them must not advance the global RNG.
         with torch.random.fork_rng(devices=[]):
-            decoder = make_map(described, residual=residual, in_keys=in_keys, out_keys=out_keys)
+            decoder = make_map(described, residual=residual, **given)
             encoder = None if info.encoder is None else GMVAE(**info.encoder)
         if encoder is not None:
             inner = {key for key in state if key.startswith(_ENCODER)}
