@@ -334,6 +334,19 @@ def test_encode_inverts_decode_inside_the_bounds(blend: float) -> None:
     torch.testing.assert_close(found, synergy[:, :2], atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
+def test_encode_with_nearly_parallel_components_is_the_nearest_in_the_box(
+    batch: tuple[int, ...],
+) -> None:
+    basis = torch.tensor([[0.5, 0.0, 0.5], [0.5, 0.01, 0.5]])
+    decoder = SARDecoder.from_basis(torch.zeros(3), basis, blend=1.0)
+    action = torch.tensor([0.25, 0.05, 0.25]).expand(*batch, 3)
+    found = decoder.encode(action)
+    # Without the box: (-4.5, 5), whose clamped values (-1, 1) cancel.
+    assert found.shape == (*batch, 2)
+    torch.testing.assert_close(found, torch.tensor([-0.5, 1.0]).expand_as(found), atol=1e-3, rtol=0)
+
+
 def test_log_slope_is_the_log_determinant_inside_the_bounds() -> None:
     decoder = by_hand(blend=0.6)
     row = torch.tensor([0.2, -0.1, 0.3, 0.1, -0.2])

@@ -10,6 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_etl.functional import bounded_least_squares
 from torchrl_etl.modules.recorded_actions import as_actions, as_bounds
 from torchrl_etl.modules.synergy_map import SynergyMap
 
@@ -143,11 +144,11 @@ class SARDecoder(SynergyMap):
 
     @torch.no_grad()
     def encode(self, action: Tensor | np.ndarray) -> Tensor:
-        """Coefficients [*, d] of actions [*, n] by least squares, clamped to [-1, 1]."""
+        """Coefficients [*, d] of actions [*, n] by least squares within [-1, 1]."""
         action = as_actions(action, low=self.low, high=self.high)
         middle = (self.low + self.high) / 2
         synergies = (action - self.residual * middle) / self.module.blend - self.module.mean
-        return (synergies @ self.module.basis.pinverse()).clamp(-1, 1)
+        return bounded_least_squares(self.module.basis.mT, synergies)
 
     @property
     def config(self) -> dict[str, Any]:
