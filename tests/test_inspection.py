@@ -19,11 +19,12 @@ from omegaconf import OmegaConf
 from tests.commands import command, recipe_module
 from tests.configs import ROOT, tiny
 from torchrl_etl.analysis.viewer import Session
+from torchrl_etl.analysis.viewer.muscles import driven_muscles
 from torchrl_etl.analysis.viewer.page import Page, check_port
 from torchrl_etl.envs import SimulationError, actuator_names
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.inspection import open_bundle, open_run, open_zoo
-from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.modules import SARDecoder, SynergyDecoder
 from torchrl_etl.synergies import BundleError, save_bundle
 from torchrl_etl.zoo import ZooError, read_card
 
@@ -95,6 +96,21 @@ def test_bundle_opens_on_the_task_of_its_exploration(finished):
     subject = open_bundle(finished)
     assert subject.drivers == ["sliders"] and subject.task.name == "overactuated"
     assert subject.decoder.residual == 0.0
+
+
+@pytest.mark.parametrize(
+    "decoder",
+    [SARDecoder.from_basis(torch.zeros(16), torch.ones(2, 16)), SynergyDecoder(2, 16, residual=1)],
+    ids=["fixed", "free"],
+)
+def test_sliders_move_only_the_synergies_of_a_bundle_with_a_residual(decoder, tmp_path):
+    muscles = actuator_names("overactuated")
+    save_bundle(decoder, tmp_path / "a", task="overactuated", actuators=muscles)
+    with Session(open_bundle(tmp_path / "a")) as session:
+        session.coefficients[0] = 1.0
+        session.step()
+        assert session.subject.drivers == ["sliders"] and session.steps == 1
+        assert len(driven_muscles(session.subject.decoder, muscles)) == 2
 
 
 def test_zoo_entry_repeats_the_first_return_on_its_card():

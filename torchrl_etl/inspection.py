@@ -72,7 +72,7 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: Goal | None = Non
             that has not been imported.
         ValueError: if there is no such task.
     """
-    decoder, info = load_bundle(bundle, residual=0.0)
+    decoder, info = load_bundle(bundle)
     if env is None:
         remedy = f"pass env={info.task} yourself if you trust it"
         check_imported(info.task, f"The task of {bundle}", BundleError, remedy)
