@@ -9,11 +9,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch.nn.functional import softmax
+from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate
 
 from tests import test_objectives_sac as plain
 from tests.loss_checks import SEED
 from torchrl_etl.functional import categorical_mean, project_categorical
+from torchrl_etl.modules import make_actor, make_critic
+from torchrl_etl.objectives import make_sac_loss
 
 SUPPORT = torch.linspace(-2.0, 2.0, 5)
 
@@ -109,3 +112,13 @@ def test_critics_learn_the_target_and_the_actor_the_smaller_mean():
 def test_uneven_or_unordered_support_is_refused(support):
     with pytest.raises(ValueError, match="evenly spaced, ascending"):
         make_loss(support=support)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_loss_of_networks_on_cuda_has_its_support_there():
+    spec = Bounded(0.0, 1.0, shape=(5,))
+    actor = make_actor({"observation": 3}, spec).cuda()
+    critic = make_critic({"observation": 3, "action": 5}, bins=5).cuda()
+    loss = make_sac_loss(actor, critic, action_spec=spec, bins=5, return_bound=2.0)
+    assert loss.support.is_cuda and loss(batch().cuda())["loss_qvalue"].isfinite()

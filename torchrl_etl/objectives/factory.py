@@ -28,7 +28,6 @@ def make_sac_loss(
     num_critics: int = 2,
     bins: int = 1,
     return_bound: float | None = None,
-    train_decoder: bool = False,
     **options: Any,
 ) -> LeanSACLoss:
     """SAC's losses over actions, or over synergies that ``decoder`` maps to actions.
@@ -44,9 +43,8 @@ def make_sac_loss(
         num_critics (int): ensemble size; targets and actor loss use the minimum.
         bins (int): above 1, critics are categorical with ``bins`` atoms in ±``return_bound``.
         return_bound (float, optional): largest return, in units of the reward that the loss reads.
-        train_decoder (bool): train the decoder on the actor loss.
-        **options: see :class:`LeanSACLoss`; ``action_spec`` is the unbatched spec of the actor's
-            output.
+        **options: see :class:`LeanSACLoss` and, with a decoder, :class:`SynergySACLoss`;
+            ``action_spec`` is the unbatched spec of the actor's output.
 
     Raises:
         ValueError: if a number is out of range, or ``bins`` is above 1 without ``return_bound``.
@@ -69,7 +67,7 @@ def make_sac_loss(
     if decoder is None:
         sac = LeanSACLoss(actor, critic, **options)
     else:
-        sac = SynergySACLoss(actor, critic, decoder, train_decoder=train_decoder, **options)
+        sac = SynergySACLoss(actor, critic, decoder, **options)
     sac.make_value_estimator(gamma=gamma)
     return sac
 

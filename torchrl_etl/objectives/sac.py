@@ -49,7 +49,7 @@ class LeanSACLoss(SACLoss):
 
     Keyword Args:
         support (Tensor, optional): evenly spaced returns [K], ascending; the critics then have K
-            outputs. Default: ``None``, one output, the value itself.
+            outputs. It is copied to their device. Default: ``None``, one output, the value itself.
         loss_function (str): ``"l2"``, ``"l1"`` or ``"smooth_l1"``, for scalar critics; categorical
             critics always minimize cross entropy. ``"l2"`` is the squared error, summed over
             critics; Stable-Baselines3 takes half of it. Default: ``"l2"``. TorchRL's is
@@ -130,7 +130,7 @@ class LeanSACLoss(SACLoss):
         super().__init__(actor_network, qvalue_network, loss_function=loss_function, **kwargs)
         if support is not None:
             _check_support(support)
-            support = support.detach().clone()
+            support = support.detach().to(self.alpha_init.device, copy=True)
         self.register_buffer("support", support)
         self.entropy_dims = entropy_dims
 
