@@ -16,6 +16,7 @@ def bounded_least_squares(weight: Tensor, target: Tensor) -> Tensor:
     Clamping the unbounded solution would be far from the minimum where columns of W are nearly
     parallel: their coefficients are then large and cancel. Where the unbounded solution is inside
     the box, it is returned. Elsewhere, 30 rounds over the coordinates come close to the minimum.
+    These cases are told apart in Python, so that it fails under ``torch.vmap``.
 
     Args:
         weight (Tensor): W [n, d].
