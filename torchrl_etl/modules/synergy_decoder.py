@@ -55,7 +55,7 @@ class _ScaledDecoder(nn.Module):
     def forward(self, synergy: Tensor) -> Tensor:
         direct = self.decoder.action_dim if self.residual else 0
         check_width(self.decoder.latent_dim + direct, synergy=synergy)
-        synergy = synergy.to(next(self.decoder.parameters()).dtype)
+        synergy = synergy.to(self.decoder.mlp[0].weight.dtype)
         if not self.residual:
             return self.decoder(self.center + self.scale * synergy)
         return self.decoder.denormalize(tanh_sum(*self.summands(synergy)))
