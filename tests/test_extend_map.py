@@ -102,8 +102,30 @@ def test_run_imports_the_module_of_its_own_map_and_a_bundle_does_not(tmp_path, m
     monkeypatch.delitem(sys.modules, __name__)  # as in a new process
     Experiment(resumed_config(run), resume=run).learned()
     monkeypatch.delitem(sys.modules, __name__)
-    with pytest.raises(BundleError, match=f"files may not import '{__name__}'; import it first"):
+    with pytest.raises(BundleError, match=f"files may not import '{__name__}'; if you trust"):
         load_bundle(run)
+
+
+def test_run_learns_in_given_synergies_of_its_own_map_if_the_model_is_named(tmp_path, monkeypatch):
+    first, second = tmp_path / "first", tmp_path / "second"
+    Experiment(config_with_model("WithMap", first)).run()
+    given = f"synergies.bundle='{first}'"
+    monkeypatch.delitem(sys.modules, __name__)  # as in a new process
+    with pytest.raises(BundleError, match="import it first in Python, or, to learn with it, give"):
+        Experiment(tiny(f"run_dir='{second}'", given))
+    Experiment(config_with_model("WithMap", second, given)).run()
+    monkeypatch.delitem(sys.modules, __name__)
+    Experiment(resumed_config(second), resume=second).learned()
+
+
+def test_zoo_entry_with_a_map_of_a_module_that_is_not_imported_is_refused(tmp_path, monkeypatch):
+    Experiment(config_with_model("WithMap", tmp_path / "run")).run()
+    export_run(tmp_path / "run", tmp_path / "toy", composed, CONF, episodes=1)
+    monkeypatch.delitem(sys.modules, __name__)
+    for opened in (zoo.load, zoo.untrained):
+        with pytest.raises(zoo.ZooError, match=f"may not import '{__name__}'; if you trust it, im"):
+            opened(tmp_path / "toy")
+    assert __name__ not in sys.modules
 
 
 @pytest.mark.parametrize(

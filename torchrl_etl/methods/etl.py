@@ -97,9 +97,12 @@ class ETL(Method):
         """Check the given synergies; compute the body's, if asked for and not saved already."""
         config, space = self.context.config, self.context.spec
         given, own = config.synergies.bundle, self.context.folder.synergies
+        kind = config.synergies.kind
         # Store the absolute path in the run's configuration.
         absolute = given if given == BODY else str(zoo.bundle_path(given).resolve())
         self.record_no_exploration(bundle=absolute)
+        if ":" in str(kind):  # names the module of a user's own map, also for a resumed run
+            config.synergies.kind = kind
         config.stage = "learn"
         if given == BODY and not surviving_folder(own).exists():
             with closing(self.context.make_env(seed=0)) as env:
@@ -107,7 +110,7 @@ class ETL(Method):
                 self.of_body = body_synergies(env, config.num_synergies)
             config.num_synergies = self.of_body.num_synergies
             return
-        _, info = load_bundle(self.bundle)
+        _, info = self._load()
         config.num_synergies = info.num_synergies
         check_compatible(info, space.actuators, space.low.tolist(), space.high.tolist())
 
@@ -250,10 +253,10 @@ class ETL(Method):
         return super().frames_before()
 
     def _load(self) -> tuple[SynergyMap, BundleInfo]:
-        kind = self.context.config.synergies.kind or ""
-        if ":" in kind:  # loading a map of the user's own needs its module, others do not
+        kind = self.context.config.synergies.kind
+        if module := str(kind).rpartition(":")[0]:  # a map of the user's own needs it
             with suppress(ImportError):
-                import_user_module(kind.rpartition(":")[0], repr(kind))
+                import_user_module(module, repr(kind))
         return load_bundle(self.bundle, residual=self.context.config.learn.decoder.residual)
 
     def stage(self) -> Stage:

@@ -32,12 +32,17 @@ from torchrl_etl.synergies.bundle_info import (
     default_kind,
     read_description,
 )
+from torchrl_etl.user_code import check_imported
 
 __all__ = ["BUNDLE_FILES", "bundle_files", "copy_bundle", "load_bundle", "save_bundle"]
 
 _DEFAULT_MAP = "synergies"  # its descriptions have no kind, as there once was no other
 _ENCODER = "encoder."
 _TENSORS = "synergies.safetensors"
+_IMPORT_FIRST = (
+    "if you trust it, import it first in Python, or, to learn with it, give etl_sac.py both "
+    "synergies=NAME, your model, and synergies.bundle=FOLDER"
+)
 BUNDLE_FILES = (_TENSORS, DESCRIPTION)
 """File names of a bundle."""
 
@@ -155,7 +160,8 @@ def load_bundle(
         tuple of SynergyMap and BundleInfo: the decoder on the CPU, and its description.
 
     Raises:
-        BundleError: if there is no bundle, it is damaged, or it has another format version.
+        BundleError: if there is no bundle, it is damaged, it has another format version, or the
+            module of its map has not been imported.
 
     Examples:
         >>> load_bundle("nowhere")
@@ -184,6 +190,8 @@ def load_bundle(
             "it was saved; explore again, or take another bundle."
         )
     described = {"kind": _DEFAULT_MAP, **info.config}
+    source = f"The decoder in {str(folder)!r}"
+    check_imported(described["kind"], source, BundleError, _IMPORT_FIRST)
     keys = {"in_keys": in_keys, "out_keys": out_keys}
     given = {name: value for name, value in keys.items() if value is not None}
     try:

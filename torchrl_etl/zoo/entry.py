@@ -265,6 +265,9 @@ def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
             f"{path} is damaged or belongs to another entry: its SHA-256 is not the one in {CARD}; "
             "copy the entry again."
         )
+    if isinstance(decoder := card.policy.get("decoder"), dict):
+        remedy = "if you trust it, import it first in Python, as no setting of the recipes does"
+        check_imported(decoder.get("kind"), f"The decoder of {folder}", ZooError, remedy)
     try:
         return _fill(folder, make_policy(**card.policy), safetensors.torch.load(content))
     except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
