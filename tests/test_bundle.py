@@ -293,6 +293,13 @@ def test_saving_a_non_finite_decoder_is_refused(fault, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_saving_a_map_of_a_script_is_refused(tmp_path):
+    mine = type("MyMap", (SynergyDecoder,), {"__module__": "__main__"})
+    with pytest.raises(ValueError, match=r"MyMap is defined in the script .* module of its own"):
+        save_bundle(mine(2, 3), tmp_path / "own", task="toy", actuators=["a", "b", "c"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_loading_a_non_finite_decoder_is_refused(tmp_path, monkeypatch):
     decoder = SynergyDecoder(2, 3)
     with torch.no_grad():

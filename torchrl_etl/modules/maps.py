@@ -21,7 +21,7 @@ def describe_map(decoder: SynergyMap) -> dict[str, Any]:
     """The map's kind and the arguments of its constructor, as JSON-able values.
 
     Raises:
-        ValueError: if it is not a map.
+        ValueError: if it is not a map, or its class cannot be imported, as it is in a script.
 
     Examples:
         >>> describe_map(SynergyDecoder(1, 2, hidden=[8]))
@@ -33,6 +33,11 @@ def describe_map(decoder: SynergyMap) -> dict[str, Any]:
         raise ValueError(
             f"The decoder is a {own.__name__}; it must be a SynergyMap, such as a SynergyDecoder "
             "from SynergyDecoder.from_directions."
+        )
+    if own.__module__ == "__main__":
+        raise ValueError(
+            f"{own.__name__} is defined in the script that runs, from which no other can import "
+            "it; put the class into a module of its own."
         )
     names = {of: kind for kind, of in MAPS.items()}
     return {"kind": names.get(own, f"{own.__module__}:{own.__name__}"), **decoder.config}
