@@ -36,6 +36,7 @@ from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH
 from torchrl_etl.synergies import (
+    SYNERGY_MODELS,
     BundleError,
     Recording,
     SynergyModel,
@@ -44,6 +45,7 @@ from torchrl_etl.synergies import (
     save_bundle,
 )
 from torchrl_etl.synergies.bundle_info import read_description
+from torchrl_etl.user_code import find_class
 from torchrl_etl.user_conf import group_files
 
 CONF = Path(__file__).parent / "conf"
@@ -107,9 +109,11 @@ def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
     check_integer(0, seed=config.seed)
     check_real("[0, 1]", vaf=config.vaf)
     check_real("(-inf, inf)", low=config.low, high=config.high)
-    options = {"updates": config.updates, **OmegaConf.to_container(config.synergies, resolve=True)}
+    options = OmegaConf.to_container(config.synergies, resolve=True)
     kind = options.pop("kind")
     options.pop("bundle")
+    if find_class(kind, SYNERGY_MODELS, SynergyModel).updates is not None:  # it trains
+        options.setdefault("updates", config.updates)
     return kind, options
 
 

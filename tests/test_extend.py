@@ -200,6 +200,7 @@ def test_random_synergies_fit_recordings_worse_than_nmf(page_files, capsys):
 
 def test_synergies_recipe_sets_the_updates_of_a_users_model(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Learned, "updates", 2000)
     monkeypatch.setattr(Learned, "fit", lambda self, actions: seen.append(self.updates))
     seen = []
     np.save("emg.npy", np.random.default_rng(0).random((40, 4)))

@@ -198,6 +198,13 @@ def test_options_may_be_numpy_numbers(tmp_path) -> None:
         fit_synergies(activity(), "gmvae", 2, num_components=True)
 
 
+def test_updates_of_a_model_that_does_not_train_are_refused() -> None:
+    with pytest.raises(TypeError, match="updates is 7, but PCASynergies does not train"):
+        fit_synergies(activity(), "pca", 2, low=0.0, high=1.0, updates=7)
+    for kind in ("gmvae", "vae"):
+        assert fit_synergies(activity(), kind, 2, low=0.0, high=1.0, updates=7).updates == 7
+
+
 def test_unknown_kind_is_refused_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="nmf"):
         fit_synergies(activity(), "nfm")

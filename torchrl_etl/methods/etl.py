@@ -215,7 +215,8 @@ class ETL(Method):
 
         def make_model(d: int) -> SynergyModel:
             model = make_synergy_model(context, d)
-            model.updates = updates
+            if model.updates is not None:
+                model.updates = updates
             return model
 
         try:

@@ -56,8 +56,9 @@ def fit_synergies(
         SynergyModel: the fitted model; ``model.save(path, actions, ...)`` writes its bundle.
 
     Raises:
-        TypeError, ValueError: before anything is fitted, if the kind is unknown, or actions or
-            bounds do not fit (see :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
+        TypeError, ValueError: before anything is fitted, if the kind is unknown or takes no
+            ``updates``, or actions or bounds do not fit (see
+            :func:`~torchrl_etl.modules.recorded_actions.as_actions`).
 
     Examples:
         >>> import numpy as np
@@ -80,6 +81,10 @@ def fit_synergies(
     found = as_actions(actions, low=low, high=high, min_rows=2)
     model = kind(low, high, num_synergies, **options)
     if updates is not None:
+        if model.updates is None:
+            raise TypeError(
+                f"updates is {updates}, but {kind.__name__} does not train; leave it out."
+            )
         check_integer(1, updates=updates)
         model.updates = updates
     model.fit(found)

@@ -36,6 +36,7 @@ class GMVAESynergies(SynergyModel):
     """
 
     kind = "gmvae"
+    updates: int = 2000
     loss: GMVAELoss
 
     def __init__(

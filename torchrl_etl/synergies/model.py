@@ -39,15 +39,15 @@ class SynergyModel(ABC):
         loss (LossModule, optional): trained during stage 1 on the entry ``action``; ``None`` for a
             model that is fitted once, on all actions.
         lr (float): learning rate of the loss.
-        updates (int): updates in :meth:`fit`, if it trains; ``fit_synergies`` and the VAF figure
-            override it.
+        updates (int, optional): updates in :meth:`fit`, of the class; ``fit_synergies`` and the VAF
+            figure override it. ``None`` for a model that does not train.
     """
 
     kind: ClassVar[str]
     num_synergies: int
     loss: LossModule | None = None
     lr: float = 1e-3
-    updates: int = 2000
+    updates: int | None = None
 
     @abstractmethod
     def fit(self, actions: Tensor, *, on_update: Callable[[], None] = lambda: None) -> None:
