@@ -23,7 +23,7 @@ def bounded_least_squares(weight: Tensor, target: Tensor) -> Tensor:
         target (Tensor): t [*, n].
 
     Returns:
-        Tensor: x [*, d] in [-1, 1].
+        Tensor: x [*, d] in [-1, 1], of the target's dtype. Half precision is solved in single.
 
     Examples:
         >>> import torch
@@ -31,10 +31,14 @@ def bounded_least_squares(weight: Tensor, target: Tensor) -> Tensor:
         >>> bounded_least_squares(nearly_parallel, torch.tensor([0.5, 0.1]))
         tensor([-0.5000,  1.0000])
     """
+    dtype = target.dtype
+    weight, target = (
+        each.to(torch.promote_types(dtype, torch.float32)) for each in (weight, target)
+    )
     x = target @ weight.pinverse().mT
     outside = (x.abs() > 1).any(-1)
     if not outside.any():
-        return x
+        return x.to(dtype)
     found, gram, moment = x[outside].clamp(-1, 1), weight.mT @ weight, target[outside] @ weight
     curvature = gram.diagonal().clamp_min(torch.finfo(gram.dtype).tiny)
     for _ in range(_SWEEPS):
@@ -42,4 +46,4 @@ def bounded_least_squares(weight: Tensor, target: Tensor) -> Tensor:
             slope = found @ gram[i] - moment[..., i]
             found[..., i] = (found[..., i] - slope / curvature[i]).clamp(-1, 1)
     x[outside] = found
-    return x
+    return x.to(dtype)

@@ -107,8 +107,8 @@ class SARDecoder(SynergyMap):
         bounds = as_bounds(low, high, action_dim)
         super().__init__(
             _BlendedBasis(num_synergies, *bounds, blend),
-            in_keys=list(in_keys),
-            out_keys=list(out_keys),
+            in_keys,
+            out_keys,
         )
         self.num_synergies, self.action_dim = num_synergies, action_dim
         self.residual = 1.0 - blend  # the share of an actuator's range that the raw action has

@@ -131,8 +131,8 @@ class SynergyDecoder(SynergyMap):
         decoder = ActionDecoder(num_synergies, action_dim, low=low, high=high, hidden=hidden)
         super().__init__(
             _ScaledDecoder(decoder, residual),
-            in_keys=[in_keys] if isinstance(in_keys, str) else list(in_keys),
-            out_keys=[out_keys] if isinstance(out_keys, str) else list(out_keys),
+            in_keys,
+            out_keys,
         )
         self.num_synergies, self.action_dim, self.residual = num_synergies, action_dim, residual
 
@@ -271,10 +271,7 @@ class SynergyDecoder(SynergyMap):
             (layer,) = (m for m in scaled.decoder.modules() if isinstance(m, nn.Linear))
             unit = scaled.decoder.normalize(action).clamp(-NEAREST, NEAREST)
             offset = layer.bias + layer.weight @ scaled.center
-            weight, target = layer.weight * scaled.scale, unit.atanh() - offset
-            solver_dtype = torch.promote_types(action.dtype, torch.float32)  # none for half
-            found = bounded_least_squares(weight.to(solver_dtype), target.to(solver_dtype))
-            return found.to(action.dtype)
+            return bounded_least_squares(layer.weight * scaled.scale, unit.atanh() - offset)
         if self.encoder is not None:
             latent = self.encoder.infer(action)
             return ((latent - scaled.center) / scaled.scale).clamp(-1, 1)

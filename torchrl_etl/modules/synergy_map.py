@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any, Self
 
 import numpy as np
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
 from torchrl.data import Bounded
 
 from torchrl_etl.modules.gmvae import GMVAE
@@ -42,6 +43,16 @@ class SynergyMap(TensorDictModule):
     low: Tensor
     high: Tensor
     encoder: GMVAE | None = None
+
+    def __init__(
+        self,
+        module: nn.Module,
+        in_keys: NestedKey | Sequence[NestedKey],
+        out_keys: NestedKey | Sequence[NestedKey],
+    ) -> None:
+        # TensorDictModule would take a tuple for one nested key.
+        keys = ([each] if isinstance(each, str) else [*each] for each in (in_keys, out_keys))
+        super().__init__(module, *keys)
 
     def log_slope(self, synergy: Tensor) -> Tensor:
         """ln |det ∂a/∂r| [*] of the action a by the residual r, at ``synergy`` [*, d+n].
