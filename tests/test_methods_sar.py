@@ -118,3 +118,15 @@ def test_sar_plays_on_another_task_of_the_same_body(tmp_path):
 def test_sar_refuses_invalid_play_options(option, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         Experiment(rival("sar", tmp_path / "run", f"method.options.{option}"))
+
+
+@pytest.mark.parametrize(("steps", "needed"), [(50, 200), (200, 800)])
+def test_sar_plans_with_the_configured_length_of_an_episode(steps, needed, tmp_path):
+    def sar(rollout_frames):
+        length = f"+env_kwargs.max_episode_steps={steps}"
+        frames = f"method.options.rollout_frames={rollout_frames}"
+        return Experiment(rival("sar", tmp_path / "run", "frames=2000", length, frames)).method
+
+    assert sar(needed).rollout_frames == needed
+    with pytest.raises(ValueError, match=f"need {needed} for two whole episodes of {steps} steps"):
+        sar(needed - 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.baselines import best_episodes
 from torchrl_etl.checks import check_integer, check_real, naming
-from torchrl_etl.envs import EnvironmentSpec, episode_length, make_env, resolve_task
+from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.method import Method
@@ -23,6 +23,7 @@ from torchrl_etl.modules.return_scale import episode_numbers
 from torchrl_etl.objectives import DecoderLoss
 from torchrl_etl.synergies import SARSynergies
 from torchrl_etl.training.context import Context
+from torchrl_etl.training.evaluation import longest_episode
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
 from torchrl_etl.training.stage import Stage
@@ -64,18 +65,17 @@ class SAR(Method):
         self.charged_frames = self.options["frames"] + self.rollout_frames
         self.num_synergies = min(self.options["num_synergies"], context.spec.action_dim)
         self.blend = self.resolve_for_body(self.options["blend"])
-        self.play_spec = context.spec
+        played, self.play_spec = context.task, context.spec
         if self.task is not None:
-            env = make_env(self.task, action_repeat=config.action_repeat)
-            self.play_spec = EnvironmentSpec.of(env, context.device)
+            played |= {"name": self.task, "goal": None, "success_key": None}
+            self.play_spec = EnvironmentSpec.of(make_env(**played), context.device)
             if self.play_spec.actuators != context.spec.actuators:
                 raise ValueError(
                     f"method.options.play_task is {self.task}, but its actuators are not those of "
                     f"{config.env}; choose a task of the same body."
                 )
-        played = (self.task, None) if self.task else (config.env, config.goal)
-        self.played = resolve_task(*played).env_id
-        steps, simulators = episode_length(*played) or 0, config.collector.num_envs
+        self.played = resolve_task(played["name"], played["goal"]).env_id
+        steps, simulators = longest_episode(played, unlimited=0), config.collector.num_envs
         if self.rollout_frames < (needed := steps * max(2, simulators)):
             raise ValueError(
                 f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "

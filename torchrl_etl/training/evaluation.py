@@ -155,12 +155,12 @@ def evaluate_task(
     )
 
 
-def longest_episode(task: Mapping[str, Any]) -> int:
-    """Time limit of an episode in simulator steps; 1,000 if the task has none.
+def longest_episode(task: Mapping[str, Any], *, unlimited: int = 1000) -> int:
+    """Time limit of an episode in simulator steps; ``unlimited`` if the task has none.
 
     Examples:
         >>> longest_episode({"name": "overactuated"})
         25
     """
     steps = (task.get("env_kwargs") or {}).get("max_episode_steps")
-    return steps or episode_length(task["name"], task.get("goal")) or 1000
+    return steps or episode_length(task["name"], task.get("goal")) or unlimited
