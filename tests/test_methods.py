@@ -23,6 +23,7 @@ from torchrl_etl.modules import SynergyDecoder
 from torchrl_etl.synergies import save_bundle
 from torchrl_etl.training import resumed_config, run_alone
 from torchrl_etl.training.checkpoints import Checkpoints
+from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -353,10 +354,19 @@ def test_dynsyn_paper_preset_has_the_published_amplitude(tmp_path):
     assert network.amplitude.item() == pytest.approx(0.05)
 
 
-def test_leg_and_hand_options_are_chosen_by_the_body(tmp_path):
-    resolve_for_body = Experiment(tiny("method=sac", "env=humanoid-stand")).method.resolve_for_body
-    assert resolve_for_body({"legs": 1.0, "hands": 0.66}) == 1.0
-    assert resolve_for_body(0.5) == 0.5
+def test_leg_and_hand_options_are_chosen_by_the_body(tmp_path, monkeypatch):
+    method = Experiment(tiny("method=sac", "env=humanoid-stand")).method
+    build, built = Context.make_env, []
+
+    def recorded(context):
+        built.append(build(context))
+        return built[-1]
+
+    monkeypatch.setattr(Context, "make_env", recorded)
+    assert method.resolve_for_body({"legs": 1.0, "hands": 0.66}) == 1.0
+    assert method.resolve_for_body({"legs": 2, "hands": 1}) == 2
+    assert method.resolve_for_body(0.5) == 0.5
+    assert [env.is_closed for env in built] == [True]
     assert Experiment(rival("sar", tmp_path / "run")).method.blend == 0.66
     one_number = rival("dynsyn", tmp_path / "run", "method.options.amplitude=5")
     assert Experiment(one_number).method.amplitude == 5

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from torchrl_etl.envs import has_free_root
 from torchrl_etl.modules import SynergyMap
@@ -117,6 +118,12 @@ class Method(ABC):
 
         Bodies with a floating root count as legs.
         """
-        if not isinstance(option, Mapping):
-            return option
-        return option["legs" if has_free_root(self.context.make_env()) else "hands"]
+        return option[self._body] if isinstance(option, Mapping) else option
+
+    @cached_property
+    def _body(self) -> Literal["legs", "hands"]:
+        env = self.context.make_env()
+        try:
+            return "legs" if has_free_root(env) else "hands"
+        finally:
+            env.close()
