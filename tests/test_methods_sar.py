@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tests.configs import rival
 from torchrl_etl.analysis import synergy_effects
 from torchrl_etl.experiment import Experiment
-from torchrl_etl.methods.sar import SAR, finished_episodes, rollouts
+from torchrl_etl.methods.sar import SAR, episode_returns, rollouts
 from torchrl_etl.synergies import load_bundle
 from torchrl_etl.training import run_alone
 from torchrl_etl.training.loop import StopOnSignal
@@ -24,26 +24,27 @@ def rollout_batch(episodes: list[int], so_far: list[float], done: list[bool]) ->
     return TensorDict({"episode": torch.tensor(episodes), "next": following}, [len(done)])
 
 
-def test_finished_episodes_are_found_with_their_returns():
+def test_returns_of_finished_episodes_are_found():
     far = 5 + (2 << 32)  # an episode number of another machine
     rows = rollout_batch(
         [3, 3, far, 7, 7], [1.0, 4.0, 9.0, 2.0, 6.0], [False, True, False, False, True]
     )
-    found = finished_episodes(rows)
-    assert found["episodes"].unique(return_inverse=True)[1].tolist() == [0, 0, 1, 1]
-    assert found["returns"].tolist() == [4.0, 4.0, 6.0, 6.0]
-    assert torch.equal(found["actions"], torch.eye(5)[[0, 1, 3, 4]])
+    episode, returns = episode_returns(rows)
+    assert episode.tolist() == [0, 0, 2, 1, 1]
+    assert torch.equal(returns.nan_to_num(-1), torch.tensor([4.0, 6.0, -1.0]))
 
 
 def test_sar_keeps_later_episodes_above_the_percentile_of_the_preview(tmp_path):
     sar = Experiment(rival("sar", tmp_path / "run", "method.options.preview_episodes=2")).method
     # Every episode has one step. 10 and 0 are the preview, whose 80th percentile is 8: of the
-    # later returns 9, 7 and 11, those of 9 and 11 are kept.
-    rows = rollout_batch([0, 1, 2, 3, 4], [10.0, 0.0, 9.0, 7.0, 11.0], [True] * 5)
-    assert torch.equal(sar.best(rows), torch.eye(5)[[2, 4]])
+    # later returns 9, 7 and 11, those of 9 and 11 are kept; the last episode has no end.
+    rows = rollout_batch(
+        [0, 1, 2, 3, 4, 5], [10.0, 0.0, 9.0, 7.0, 11.0, 12.0], [True] * 5 + [False]
+    )
+    assert torch.equal(sar.best(rows), torch.eye(6)[[2, 4]])
     # The preview is half of the episodes at most: one of two, none of one.
-    assert torch.equal(sar.best(rows[:2]), torch.eye(5)[[1]])
-    assert torch.equal(sar.best(rows[:1]), torch.eye(5)[[0]])
+    assert torch.equal(sar.best(rows[:2]), torch.eye(6)[[1]])
+    assert torch.equal(sar.best(rows[:1]), torch.eye(6)[[0]])
 
 
 def test_play_rollouts_are_new_whole_episodes_without_updates(tmp_path):

@@ -112,16 +112,16 @@ class SAR(Method):
 
     def best(self, rows: TensorDictBase) -> Tensor:
         """Activations of episodes whose returns exceed the percentile of the preview episodes."""
-        found = finished_episodes(rows)
-        numbers = found["episodes"].unique()
-        preview = numbers[: min(self.options["preview_episodes"], len(numbers) // 2)]
-        returns = [found["returns"][found["episodes"] == number][:1] for number in preview]
-        fresh = ~torch.isin(found["episodes"], preview)
-        return best_episodes(
-            **{key: value[fresh] for key, value in found.items()},
+        episode, returns = episode_returns(rows)
+        whole = returns.isfinite().nonzero().squeeze(-1)
+        previewed = min(self.options["preview_episodes"], len(whole) // 2)
+        preview, fresh = whole[:previewed], whole[previewed:]
+        best = best_episodes(
+            returns[fresh],
             percentile=self.options["percentile"],
-            preview=torch.cat(returns) if returns else None,
+            preview=returns[preview] if previewed else None,
         )
+        return rows["next", "activation"][torch.isin(episode, fresh[best])]
 
     def fit(self, actions: Tensor) -> SARSynergies:
         spec, seed = self.context.spec, self.context.config.seed
@@ -191,15 +191,10 @@ def rollouts(stage: Stage, frames: int, check: Callable[[], None]) -> Work[Tenso
     return torch.cat(rows)
 
 
-def finished_episodes(rows: TensorDictBase) -> dict[str, Tensor]:
-    """Activations [N, n], returns [N] and episode indices [N] of all steps of whole episodes."""
+def episode_returns(rows: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Index [N] of each row's episode, and returns [E], NaN for an episode that has no end."""
     numbers, episode = rows["episode"].unique(return_inverse=True)
-    ends = rows["next", "done"].reshape(-1)
-    returns = torch.full(numbers.shape, torch.nan)
-    returns[episode[ends]] = rows["next", "episode_reward"].reshape(-1)[ends]
-    whole = returns[episode].isfinite()
-    return {
-        "actions": rows["next", "activation"][whole],
-        "returns": returns[episode][whole],
-        "episodes": episode[whole],
-    }
+    so_far, ends = rows["next", "episode_reward"].reshape(-1), rows["next", "done"].reshape(-1)
+    returns = so_far.new_full(numbers.shape, torch.nan)
+    returns[episode[ends]] = so_far[ends]
+    return episode, returns
