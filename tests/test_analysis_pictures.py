@@ -1,7 +1,5 @@
 """Pictures are drawn from the data that runs write; a failed one keeps the old file."""
 
-import csv
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from torchrl_etl.analysis.pictures import (
-    _curve,
     embedding,
     learning_curves,
     synergy_heatmap,
@@ -23,45 +20,14 @@ def colors_of(path):
         return len(image.convert("RGB").getcolors(image.width * image.height))
 
 
-def rows(seed=0, solved=True, start=0):
-    return [
-        {"frames": start + 1000 * i, "return": float(i + seed), "seed": seed}
-        | ({"solved": i / 10} if solved else {})
-        for i in range(10)
-    ]
-
-
-def test_learning_curves_take_rows_a_mapping_or_a_csv_file(tmp_path):
-    table = tmp_path / "evaluations.csv"
-    with open(table, "w", newline="") as file:
-        writer = csv.DictWriter(file, ["frames", "return", "seed", "solved"])
-        writer.writeheader()
-        writer.writerows(rows())
-    several = {"ETL": rows(0, start=2000) + rows(1, start=2000), "SAC": rows(2, solved=False)}
-    for name, runs in {"one": rows(), "csv": table, "several": several}.items():
-        path = learning_curves(runs, tmp_path / "new folder" / f"{name}.png", explore_frames=2000)
-        assert colors_of(path) > 20
-
-
-def test_curve_averages_over_the_frames_that_all_seeds_reached():
-    short = [{"frames": f, "return": 10.0, "seed": 1} for f in (0, 1000)]
-    long = [{"frames": f, "return": 20.0, "seed": 2} for f in (500, 1500, 3000)]
-    frames, mean, low, high = _curve(
-        [*short, *long, {"frames": 9e9, "return": ""}][:5], "return", 1
-    )
-    assert frames.tolist() == [500, 1000]
-    assert mean.tolist() == [15.0, 15.0]
-    assert (low < mean).all() and (mean < high).all()
-    with pytest.raises(ValueError, match="no frames in common: one ends at 1000 before another"):
-        _curve(short + long[1:], "return", 1)
-
-
-def test_curves_skip_missing_values_and_refuse_a_log_without_any(tmp_path):
-    holes = [{"frames": 1, "return": "", "solved": None}, {"frames": 2, "return": "nan"}]
-    assert _curve([*holes, {"frames": 3, "return": "4.5"}], "return", 1)[0].tolist() == [3]
-    with pytest.raises(ValueError, match="'return' or 'solved'"):
-        learning_curves({"ETL": holes}, tmp_path / "curves.png")
-    assert not list(tmp_path.iterdir())
+def test_learning_curves_of_a_run_with_and_without_success(tmp_path):
+    frames = [*range(2000, 12_000, 1000)]
+    returns, solved = (frames, [*range(10)]), (frames[::2], [0.0, 0.2, 0.4, 0.6, 0.8])
+    one = learning_curves(returns, tmp_path / "new folder" / "one.png")
+    two = learning_curves(returns, tmp_path / "two.png", solved=solved, explore_frames=2000)
+    assert colors_of(one) > 20 and colors_of(two) > 20
+    with Image.open(one) as left, Image.open(two) as both:
+        assert both.width == 2 * left.width
 
 
 @pytest.mark.parametrize(("n", "d", "residual"), [(80, 4, 0.1), (3, 1, 0.0)])

@@ -167,15 +167,11 @@ class Experiment:
     def _draw_curves(self, charged: int) -> None:
         from torchrl_etl.analysis import learning_curves
 
-        frames, returns = self.folder.series("learn/eval/return")
-        solved = dict(zip(*self.folder.series("learn/eval/solved"), strict=True))
-        rows = [
-            {"frames": frame, "return": value, "solved": solved.get(frame)}
-            for frame, value in zip(frames, returns, strict=True)
-        ]
+        solved = self.folder.series("learn/eval/solved")
         learning_curves(
-            rows,
+            self.folder.series("learn/eval/return"),
             self.folder.pictures / "learning_curves.png",
+            solved=solved if solved[0] else None,
             explore_frames=charged or None,
             title=f"{self.config.env}{self.task.goal_in_words}",
         )

@@ -6,8 +6,6 @@ touches matplotlib's global state, so they may be called anywhere in a training 
 
 from __future__ import annotations
 
-import csv
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,88 +16,58 @@ import numpy as np
 from torchrl_etl.analysis.canvas import MARKERS, SERIES, count_frames, new_figure, tidy, write
 from torchrl_etl.analysis.diagnostics import synergy_effects
 from torchrl_etl.analysis.state_space import embedding
-from torchrl_etl.analysis.statistics import interval
 from torchrl_etl.modules import SynergyMap
 
 __all__ = ["embedding", "learning_curves", "synergy_heatmap", "vaf_curve"]
-
-Rows = Sequence[Mapping[str, Any]]
-
-# Column of the rows, axis label, factor to the unit of the axis.
-_PANELS = (("return", "return per episode", 1.0), ("solved", "solved episodes [%]", 100.0))
-
 
 _MUSCLES_PER_LINE = 45
 
 
 def learning_curves(
-    runs: Rows | str | os.PathLike[str] | Mapping[str, Rows | str | os.PathLike[str]],
+    returns: tuple[Sequence[int], Sequence[float]],
     path: str | os.PathLike[str],
     *,
+    solved: tuple[Sequence[int], Sequence[float]] | None = None,
     explore_frames: int | None = None,
     title: str | None = None,
 ) -> Path:
-    """Plot return, and success if known, against environment frames.
-
-    Rows with different ``seed`` form one series. Its line is the mean over seeds, on the frames
-    that all seeds reached; its band is the 95 % confidence interval of the mean.
+    """Plot a run's return, and success if known, against environment frames.
 
     Args:
-        runs: rows with ``frames`` and ``return`` or ``solved`` (a share in [0, 1]), optionally
-            ``seed``; or the path of a CSV file with such columns; or a mapping of names to either.
-            Frames include the explore stage, so that methods are compared at equal cost. Missing
-            values may be absent, empty or NaN.
+        returns (pair of sequences): frames of the evaluations, explore stage included, and the
+            return at each.
         path (path-like): where the PNG goes.
 
     Keyword Args:
+        solved (pair of sequences, optional): frames, and the share in [0, 1] of solved episodes.
         explore_frames (int, optional): shade the frames before this one as the explore stage.
         title (str, optional): title of the figure, such as the task.
 
-    Raises:
-        ValueError: if no row has frames and a return or success, or if two seeds of a series have
-            no frames in common.
-
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> rows = [{"frames": 1000 * i, "return": float(i), "solved": i / 10} for i in range(10)]
         >>> with TemporaryDirectory() as folder:
-        ...     learning_curves({"ETL": rows}, f"{folder}/curves.png").name
+        ...     learning_curves(([0, 1000], [0.5, 2.0]), f"{folder}/curves.png").name
         'curves.png'
     """
-    named = runs if isinstance(runs, Mapping) else {"": runs}
-    rows = {name: _read(source) for name, source in named.items()}
-    curves = {
-        column: {name: curve for name in rows if (curve := _curve(rows[name], column, unit))}
-        for column, _, unit in _PANELS
-    }
-    panels = [panel for panel in _PANELS if curves[panel[0]]]
-    if not panels:
-        raise ValueError(
-            f"No row of {list(rows)} has numbers for 'frames' and for 'return' or 'solved'; pass "
-            "the rows of an evaluation log."
-        )
+    panels = [("return per episode", returns[0], np.asarray(returns[1]))]
+    if solved is not None:
+        panels.append(("solved episodes [%]", solved[0], 100 * np.asarray(solved[1])))
     figure = new_figure(5.2 * len(panels), 3.6)
-    for axes, (column, label, _) in zip(
+    for axes, (label, frames, values) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
     ):
         tidy(axes)
-        for index, name in enumerate(rows):
-            if name in curves[column]:
-                frames, mean, low, high = curves[column][name]
-                look = _look(index) | {"markevery": max(1, len(frames) // 12)}
-                axes.plot(frames, mean, label=name or None, **look)
-                axes.fill_between(frames, low, high, color=look["color"], alpha=0.2, linewidth=0)
+        axes.plot(frames, values, **_look(0), markevery=max(1, len(frames) // 12))
         if explore_frames:
             axes.axvspan(0, explore_frames, color="0.93", zorder=0, label="explore stage")
         axes.set_xlim(left=0)
-        if column == "solved":
-            axes.set_ylim(-3, 103)
         axes.set_xlabel("environment frames, explore stage included")
         axes.set_ylabel(label)
         count_frames(axes)
-    handles, labels = axes.get_legend_handles_labels()
-    if labels:
-        figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    if solved is not None:
+        axes.set_ylim(-3, 103)
+    if explore_frames:
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", frameon=False)
     if title:
         figure.suptitle(title)
     return write(figure, path)
@@ -236,38 +204,3 @@ def vaf_curve(
 def _look(index: int) -> dict[str, Any]:
     index %= len(SERIES)
     return {"color": SERIES[index], "marker": MARKERS[index], "markersize": 5, "linewidth": 1.8}
-
-
-def _read(source: Rows | str | os.PathLike[str]) -> Rows:
-    if isinstance(source, (str, os.PathLike)):
-        with open(source, newline="") as file:
-            return list(csv.DictReader(file))
-    return source
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None or value == "" else float(value)
-
-
-def _curve(rows: Rows, column: str, unit: float) -> tuple[np.ndarray, ...] | None:
-    """Frames, mean and interval bounds over seeds; None if the column has no numbers."""
-    seeds: dict[str, list[tuple[float, float]]] = {}
-    for row in rows:
-        point = _number(row.get("frames")), unit * _number(row.get(column))
-        if all(map(math.isfinite, point)):
-            seeds.setdefault(str(row.get("seed", "")), []).append(point)
-    if not seeds:
-        return None
-    lines = [np.array(sorted(points)).T for points in seeds.values()]
-    frames = np.unique(np.concatenate([line[0] for line in lines]))
-    # Episodes of varying length put evaluations at slightly different frames: interpolate on a
-    # common grid, without extrapolation.
-    start, stop = max(line[0, 0] for line in lines), min(line[0, -1] for line in lines)
-    if start > stop:
-        raise ValueError(
-            f"The seeds {', '.join(seeds)} have no frames in common: one ends at {stop:g} before "
-            f"another starts at {start:g}; pass them as separate runs."
-        )
-    frames = frames[(frames >= start) & (frames <= stop)]
-    values = np.stack([np.interp(frames, *line) for line in lines])
-    return frames, *np.array([interval(at) for at in values.T]).T
