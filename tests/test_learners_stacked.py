@@ -263,15 +263,44 @@ def test_synergy_models_with_different_update_counts_are_refused():
         StackedLearners(learners).updates(inputs)
 
 
-def test_learners_of_different_sizes_are_refused():
-    small, large = (learn_stage(None, f"actor.hidden=[{width}]") for width in (8, 16))
-    with pytest.raises(
-        ValueError, match=r"learners\[1\] and learners\[0\] have parameters of different shapes"
-    ):
-        StackedLearners([small.learner, large.learner])
+def different(*settings):
+    """The learner of stage 2 with these settings."""
+    stage = learn_stage(None, *settings)
+    stage.close()
+    return stage.learner
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("actor.hidden=[16]",),
+        ("critic.hidden=[16]",),
+        ("learn.decoder.distillation_weight=0.5",),
+        ("learn.decoder.fine_tuning=frozen",),
+        ("learn.sac.normalize_observations=true",),
+    ],
+    ids=str,
+)
+def test_learners_of_other_settings_are_refused(settings):
+    with pytest.raises(ValueError, match="differ in more than parameters and buffers"):
+        StackedLearners([different(), different(*settings)])
+
+
+def test_learners_with_other_bounds_are_refused():
+    # The bounds of an actor's distribution are constants, not buffers.
+    def learner(high):
+        spec = Bounded(-1, high, shape=(2,))
+        actor = make_actor({"observation": 3}, spec)
+        critic = make_critic({"observation": 3, "action": 2})
+        return SACLearner(actor, make_sac_loss(actor, critic, action_spec=spec))
+
+    with pytest.raises(ValueError, match="differ in more than parameters and buffers"):
+        StackedLearners([learner(1.0), learner(2.0)])
+
+
+def test_no_learners_are_refused():
     with pytest.raises(ValueError, match="learners is empty"):
         StackedLearners([])
-    small.close(), large.close()
 
 
 @pytest.mark.parametrize("setting", ["learn.sac.lr=1e-2", "learn.sac.tau=0.5"])

@@ -127,3 +127,19 @@ def test_all_seeds_stop_at_a_signal_and_resume_together(tmp_path, monkeypatch):
     monkeypatch.setattr(StackedLearners, "updates", count)
     assert [end["learn"]["frames"] for end in run_interleaved(goes_on)] == [416, 416]
     assert len(passes) > 5 and {*passes} == {2}  # although they had stopped one batch apart
+
+
+def test_runs_with_other_settings_are_updated_separately(tmp_path, monkeypatch):
+    """Several runs that are resumed together may differ in networks and in weights of losses."""
+    passes = set()
+
+    def remember(group, inputs):
+        stage = 1 if group.learners[0].decoder is None else 2
+        passes.add((stage, len(group.learners)))
+        return one_after_another(group, inputs)
+
+    monkeypatch.setattr(StackedLearners, "updates", remember)
+    settings = [(), (), ("learn.decoder.distillation_weight=0.5",), ("actor.hidden=[16]",)]
+    works = [work(tmp_path / f"{i}", i, *each) for i, each in enumerate(settings)]
+    assert [end["learn"]["frames_charged"] for end in run_interleaved(works)] == [416] * 4
+    assert passes == {(1, 3), (2, 2)}

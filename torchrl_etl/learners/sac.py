@@ -17,6 +17,7 @@ from torchrl.envs.transforms import Transform
 from torchrl_etl.checks import check_real
 from torchrl_etl.draws import drawn_in, redrawn
 from torchrl_etl.learners.adam import make_optimizer, parameter_groups
+from torchrl_etl.learners.blueprint import blueprint
 from torchrl_etl.learners.compiled import compiled, cuda_graph
 from torchrl_etl.learners.ema import WarmedUpEMA
 from torchrl_etl.learners.objective import Objective
@@ -114,6 +115,7 @@ class SACLearner:
         units = {"normalizer": normalizer, "return_scale": return_scale, "reward": reward}
         self.objective = Objective(sac, actor, terms, **units, transforms=transforms)
         self.objective.to(self.device)
+        self.blueprint = blueprint(self.objective)  # equal ones can be updated in one pass
         self.statistics = self.objective.statistics
         self.targets = [FusedSoftUpdate(sac, tau=tau)]
         self.targets += [term.target for term in terms if term.target is not None]
@@ -180,6 +182,7 @@ class SACLearner:
         """A learner that minimizes these terms only and shares this learner's optimizer."""
         twin = copy(self)
         twin.objective = self.objective.only(*terms)
+        twin.blueprint = blueprint(twin.objective)
         twin.statistics = {}
         twin.targets = [term.target for term in terms if term.target is not None]
         twin.ema = WarmedUpEMA(nn.Module(), 0.0)  # of nothing: the actor stays

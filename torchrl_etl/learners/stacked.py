@@ -26,11 +26,11 @@ class StackedLearners:
     afterwards. The pass is compiled if the learners' updates are.
 
     Args:
-        learners (sequence of SACLearner): of equal sizes, bounds, settings and update counts;
-            weights, statistics and other buffers may differ.
+        learners (sequence of SACLearner): of equal networks, settings (``blueprint``) and update
+            counts; only parameters and buffers may differ.
 
     Raises:
-        ValueError: if there is no learner, or if parameter shapes differ; at an update, if update
+        ValueError: if there is no learner, or if blueprints differ; at an update, if update
             counts, learning rates, tau or EMA decay differ; at the first update, if a transform
             reads a network that is neither its submodule nor among its ``networks``.
 
@@ -60,11 +60,10 @@ class StackedLearners:
     def __init__(self, learners: Sequence[SACLearner]) -> None:
         if not learners:
             raise ValueError("learners is empty; pass at least one.")
-        shapes = [[parameter.shape for parameter in of.parameters] for of in learners]
-        if other := next((i for i, found in enumerate(shapes) if found != shapes[0]), None):
+        if len({learner.blueprint for learner in learners}) > 1:
             raise ValueError(
-                f"learners[{other}] and learners[0] have parameters of different shapes; learners "
-                "that are updated side by side need the same observations, actions and networks."
+                "The learners differ in more than parameters and buffers; learners that are "
+                "updated side by side need the same networks and settings."
             )
         self.learners = list(learners)
         self._stacks: dict[int, Tensor] = {}

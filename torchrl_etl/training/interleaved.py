@@ -73,7 +73,8 @@ class _Run(Generic[Result]):
     @property
     def alike(self) -> tuple[Any, ...]:
         """Key that is equal for runs that can be updated together."""
-        return self.due.stage, self.due.inputs["batch"].shape, self.due.learner.step_sizes
+        learner, shape = self.due.learner, self.due.inputs["batch"].shape
+        return self.due.stage, shape, learner.step_sizes, learner.blueprint
 
     def __enter__(self) -> None:
         GlobalRNGState().load_state_dict(self.random)
