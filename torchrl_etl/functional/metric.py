@@ -24,6 +24,7 @@ __all__ = [
 # Added inside square roots: too small to show in float32 distances, large enough that the gradient
 # of the root at zero is zero instead of NaN.
 EPS = 1e-12
+ANGLE_WEIGHT = 0.1  # MICo's beta, for an angle in radians
 
 
 def direction_bonus(embedding: Tensor, next_embedding: Tensor, direction: Tensor) -> Tensor:
@@ -52,16 +53,14 @@ def direction_bonus(embedding: Tensor, next_embedding: Tensor, direction: Tensor
     return ((next_embedding - embedding) * direction).sum(-1, keepdim=True)
 
 
-def l2_distance(x: Tensor, y: Tensor, eps: float = EPS) -> Tensor:
+def l2_distance(x: Tensor, y: Tensor) -> Tensor:
     r"""Euclidean distance :math:`d` between embeddings, differentiable where they coincide.
 
     Args:
         x, y (Tensor): embeddings, ``[*, k]``.
-        eps (float, optional): added inside the root, so that the gradient at ``x == y`` is zero
-            and not NaN; the distance there reads ``eps ** 0.5``. Defaults to ``1e-12``.
 
     Returns:
-        Tensor: distances, ``[*]``.
+        Tensor: distances, ``[*]``; 1e-6 with a gradient of zero where ``x == y``.
 
     Equation: 2 (the metric ``d``)
 
@@ -71,13 +70,13 @@ def l2_distance(x: Tensor, y: Tensor, eps: float = EPS) -> Tensor:
         >>> l2_distance(torch.tensor([0.0, 0.0]), torch.tensor([3.0, 4.0]))
         tensor(5.)
     """
-    return ((x - y).square().sum(-1) + eps).sqrt()
+    return ((x - y).square().sum(-1) + EPS).sqrt()
 
 
-def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> Tensor:
+def mico_distance(x: Tensor, y: Tensor) -> Tensor:
     r"""MICo's diffuse distance: mean squared norm plus a weighted angle.
 
-    .. math:: U(x, y) = \tfrac12 (\|x\|^2 + \|y\|^2) + \beta\,\angle(x, y)
+    .. math:: U(x, y) = \tfrac12 (\|x\|^2 + \|y\|^2) + 0.1\,\angle(x, y)
 
     This is a *diffuse* metric: a state's distance to itself is :math:`\|x\|^2`, not zero. It suits
     a divergence estimated from independent samples, which is not zero for a state and itself
@@ -85,8 +84,6 @@ def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> 
 
     Args:
         x, y (Tensor): embeddings, ``[*, k]``.
-        beta (float, optional): weight of the angle (radians). Defaults to ``0.1``.
-        eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
 
     Returns:
         Tensor: distances, ``[*]``.
@@ -100,16 +97,14 @@ def mico_distance(x: Tensor, y: Tensor, beta: float = 0.1, eps: float = EPS) -> 
         tensor(10.1571)
     """
     x_square, y_square = x.square().sum(-1), y.square().sum(-1)
-    x_unit = x / (x_square + eps).sqrt().unsqueeze(-1)
-    y_unit = y / (y_square + eps).sqrt().unsqueeze(-1)
+    x_unit = x / (x_square + EPS).sqrt().unsqueeze(-1)
+    y_unit = y / (y_square + EPS).sqrt().unsqueeze(-1)
     # Half-angle form: accurate and with finite gradients at 0 and pi, where arccos is neither.
-    angle = 2 * torch.atan2(l2_distance(x_unit, y_unit, eps), l2_distance(x_unit, -y_unit, eps))
-    return 0.5 * (x_square + y_square) + beta * angle
+    angle = 2 * torch.atan2(l2_distance(x_unit, y_unit), l2_distance(x_unit, -y_unit))
+    return 0.5 * (x_square + y_square) + ANGLE_WEIGHT * angle
 
 
-def gaussian_w2(
-    mean_i: Tensor, std_i: Tensor, mean_j: Tensor, std_j: Tensor, eps: float = EPS
-) -> Tensor:
+def gaussian_w2(mean_i: Tensor, std_i: Tensor, mean_j: Tensor, std_j: Tensor) -> Tensor:
     r"""2-Wasserstein distance between two diagonal Gaussians, the divergence of DBC.
 
     .. math:: W_2 = \sqrt{\|\mu_i - \mu_j\|^2 + \|\sigma_i - \sigma_j\|^2}
@@ -117,7 +112,6 @@ def gaussian_w2(
     Args:
         mean_i, std_i (Tensor): mean and standard deviation of the first, ``[*, k]``.
         mean_j, std_j (Tensor): mean and standard deviation of the second, ``[*, k]``.
-        eps (float, optional): see :func:`l2_distance`. Defaults to ``1e-12``.
 
     Returns:
         Tensor: distances, ``[*]``.
@@ -132,7 +126,7 @@ def gaussian_w2(
         ... )
         tensor(5.)
     """
-    return ((mean_i - mean_j).square().sum(-1) + (std_i - std_j).square().sum(-1) + eps).sqrt()
+    return ((mean_i - mean_j).square().sum(-1) + (std_i - std_j).square().sum(-1) + EPS).sqrt()
 
 
 def metric_target(reward_i: Tensor, reward_j: Tensor, divergence: Tensor, gamma: float) -> Tensor:

@@ -65,13 +65,11 @@ def gaussian_kl(loc_q: Tensor, scale_q: Tensor, loc_p: Tensor, scale_p: Tensor) 
     return (0.5 * (ratio.square() + shift.square() - 1) - ratio.log()).sum(-1)
 
 
-def categorical_kl(logits: Tensor, prior_logits: Tensor | None = None) -> Tensor:
-    r""":math:`\mathrm{KL}(q(c) \| p(c))` of categorical distributions given by their logits.
+def categorical_kl(logits: Tensor) -> Tensor:
+    r""":math:`\mathrm{KL}(q(c) \| p(c))` of categorical distributions from the uniform one.
 
     Args:
-        logits (Tensor): logits of ``q``, ``[*, C]``.
-        prior_logits (Tensor, optional): logits of ``p``, broadcastable to ``[*, C]``. ``None``
-            is the fixed uniform prior of the paper. Defaults to ``None``.
+        logits (Tensor): logits of ``q``, ``[*, C]``; ``p`` is the paper's fixed uniform prior.
 
     Returns:
         Tensor: divergences in nats, ``[*]``; zero for a single component.
@@ -85,20 +83,17 @@ def categorical_kl(logits: Tensor, prior_logits: Tensor | None = None) -> Tensor
         tensor(0.6931)
     """
     log_q = logits.log_softmax(-1)
-    log_p = _component_log_prior(logits, prior_logits)
-    return (log_q.exp() * (log_q - log_p)).sum(-1)
+    return (log_q.exp() * (log_q + math.log(logits.shape[-1]))).sum(-1)
 
 
-def mixture_log_prob(z: Tensor, loc: Tensor, scale: Tensor, logits: Tensor | None = None) -> Tensor:
+def mixture_log_prob(z: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
     r"""Log-density of the Gaussian-mixture prior over synergy coefficients.
 
-    .. math:: p(z) = \sum_c P_c\, \mathcal N(z; \mu_c, \Sigma_c)
+    .. math:: p(z) = \tfrac1C \sum_c \mathcal N(z; \mu_c, \Sigma_c)
 
     Args:
         z (Tensor): synergy coefficients, ``[*, d]``.
         loc, scale (Tensor): means and standard deviations of the components, ``[C, d]``.
-        logits (Tensor, optional): logits of :math:`P`, ``[C]``. ``None`` is the fixed uniform
-            prior of the paper. Defaults to ``None``.
 
     Returns:
         Tensor: log-densities, ``[*]``.
@@ -113,7 +108,7 @@ def mixture_log_prob(z: Tensor, loc: Tensor, scale: Tensor, logits: Tensor | Non
         tensor(-1.4189)
     """
     per_component = gaussian_log_prob(z.unsqueeze(-2), loc, scale)
-    return (per_component + _component_log_prior(per_component, logits)).logsumexp(-1)
+    return (per_component - math.log(len(loc))).logsumexp(-1)
 
 
 class GMVAEBound(NamedTuple):
@@ -141,7 +136,6 @@ def gmvae_bound(
     scale: Tensor,
     prior_loc: Tensor,
     prior_scale: Tensor,
-    prior_logits: Tensor | None = None,
 ) -> GMVAEBound:
     r"""Variational lower bound of the Gaussian-mixture VAE, per sample.
 
@@ -162,7 +156,6 @@ def gmvae_bound(
         loc, scale (Tensor): means and standard deviations of :math:`q(z|a,c)`, ``[*, C, d]``.
         prior_loc (Tensor): :math:`\mu_c`, ``[C, d]``.
         prior_scale (Tensor): square roots of the diagonal of :math:`\Sigma_c`, ``[C, d]``.
-        prior_logits (Tensor, optional): logits of :math:`p(c)`, ``[C]``; ``None`` is uniform.
 
     Returns:
         GMVAEBound: the bound and its three terms, each ``[*]``.
@@ -191,7 +184,7 @@ def gmvae_bound(
     log_likelihood = gaussian_log_prob(action.unsqueeze(-2), decoded, likelihood_scale)
     reconstruction = (probability * log_likelihood).sum(-1)
     latent_kl = (probability * gaussian_kl(loc, scale, prior_loc, prior_scale)).sum(-1)
-    component_kl = categorical_kl(logits, prior_logits)
+    component_kl = categorical_kl(logits)
     bound = reconstruction - latent_kl - component_kl
     return GMVAEBound(bound, reconstruction, latent_kl, component_kl)
 
@@ -217,10 +210,3 @@ def reconstruction_loss(decoded: Tensor, action: Tensor) -> Tensor:
         tensor(5.)
     """
     return (decoded - action).square().sum(-1)
-
-
-def _component_log_prior(like: Tensor, logits: Tensor | None) -> Tensor:
-    """Log-probabilities of the components: uniform over ``like``'s last dimension by default."""
-    if logits is None:
-        return like.new_full((), -math.log(like.shape[-1]))
-    return logits.log_softmax(-1)
