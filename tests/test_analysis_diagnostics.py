@@ -30,8 +30,8 @@ def test_authority_of_a_linear_decoder_by_hand():
     # The middle 90 % of U[-1, 1] spans 1.8. Actuator 0 covers its whole range, actuator 1 half of
     # its range, and actuator 2 does not move.
     decoder = LinearDecoder([[1.0, 2.0, 0.0]], [-1.0, -4.0, 0.0], [1.0, 4.0, 1.0])
-    authority = control_authority(decoder, 20_000)
-    torch.testing.assert_close(authority, torch.tensor([0.9, 0.45, 0.0]), atol=0.01, rtol=0)
+    expected = torch.tensor([0.9, 0.45, 0.0])
+    torch.testing.assert_close(control_authority(decoder), expected, atol=0.02, rtol=0)
 
 
 def test_authority_is_deterministic_and_leaves_the_global_rng_alone():
@@ -40,8 +40,6 @@ def test_authority_is_deterministic_and_leaves_the_global_rng_alone():
     first = control_authority(decoder)
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.equal(control_authority(decoder), first)
-    other = control_authority(decoder, generator=torch.Generator().manual_seed(1))
-    assert not torch.equal(other, first)
 
 
 def test_synergy_effects_are_signed_and_relative_to_the_action_range():

@@ -15,12 +15,11 @@ def test_interval_has_nominal_coverage():
     assert 49 <= hits <= 60  # nominal: 95 % of 60 = 57; a little lower for 30 skewed values
 
 
-def test_interval_is_deterministic_and_widens_with_confidence():
+def test_interval_is_deterministic_and_holds_its_mean():
     values = [3.0, 1.0, 4.0, 1.0, 5.0]
     assert interval(values) == interval(values)
     mean, low, high = interval(values)
-    _, lower, higher = interval(values, 0.99)
-    assert lower < low < mean < high < higher
+    assert low < mean < high
 
 
 def test_interval_of_constants_is_a_point_and_of_one_value_nan():
@@ -45,7 +44,6 @@ def test_success_interval_is_wilsons():
     [
         (lambda: interval([]), "no values"),
         (lambda: interval([1.0, math.nan]), "1 of 2 values are not finite"),
-        (lambda: interval([1.0, 2.0], 95), "confidence is 95"),
         (lambda: success_interval([0.5, 1.0]), "neither 0 nor 1"),
     ],
 )

@@ -10,34 +10,26 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchrl_etl.analysis.arrays import as_array, as_matrix
-from torchrl_etl.checks import check_integer
 
 if TYPE_CHECKING:
     from torchrl_etl.modules import SynergyMap
 
 __all__ = ["control_authority", "direction_alignment", "synergy_effects", "synergy_warnings"]
 
+_SAMPLES = 1024
+
 
 @torch.no_grad()
-def control_authority(
-    decoder: SynergyMap, num_samples: int = 1024, *, generator: torch.Generator | None = None
-) -> Tensor:
+def control_authority(decoder: SynergyMap) -> Tensor:
     """Fraction of its range over which the synergies move each actuator [n].
 
     The distance from the 5th to the 95th percentile of Dec(u), u uniform in [-1, 1]^d, divided by
     high − low. It is 0.9 for a muscle that follows one coefficient linearly over its whole range,
     and 0 for one that never moves. A residual is held at zero. Reports average it over actuators.
+    The 1,024 coefficient vectors are drawn with a fixed seed, without the global generator.
 
     Args:
         decoder (SynergyMap): the decoder.
-        num_samples (int): number of random coefficients. Default: 1024.
-
-    Keyword Args:
-        generator (torch.Generator, optional): source of the samples. Default: a new one with a
-            fixed seed; the global generator is not used.
-
-    Raises:
-        ValueError: if there are fewer than two samples.
 
     Examples:
         >>> from torchrl_etl.modules import GMVAE, SynergyDecoder
@@ -45,12 +37,8 @@ def control_authority(
         >>> authority.shape, bool((authority > 0).all() and (authority < 1).all())
         (torch.Size([39]), True)
     """
-    check_integer(2, num_samples=num_samples)
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
-    synergies = torch.rand(
-        num_samples, decoder.num_synergies, generator=generator, device=generator.device
-    )
+    generator = torch.Generator().manual_seed(0)
+    synergies = torch.rand(_SAMPLES, decoder.num_synergies, generator=generator)
     action = _decode(decoder, 2 * synergies - 1)
     low, high = action.quantile(torch.tensor([0.05, 0.95], device=action.device), dim=0)
     return (high - low) / (decoder.high - decoder.low)

@@ -147,7 +147,6 @@ def vaf_curve(
     path: str | os.PathLike[str],
     *,
     chosen_d: int | None = None,
-    title: str | None = None,
 ) -> Path:
     """Plot the variance accounted for against the number of synergies, one line per method.
 
@@ -159,7 +158,6 @@ def vaf_curve(
 
     Keyword Args:
         chosen_d (int, optional): the number of the run, marked by a line.
-        title (str, optional): title of the figure, such as the task.
 
     Raises:
         ValueError: if a method does not have one fraction per number of synergies.
@@ -196,8 +194,6 @@ def vaf_curve(
     axes.set_xlabel("number of synergies")
     axes.set_ylabel("variance accounted for [%]")
     axes.legend(frameon=False, loc="lower right")
-    if title:
-        axes.set_title(title)
     return write(figure, path)
 
 

@@ -27,8 +27,6 @@ def embedding(
     embeddings: Tensor | ArrayLike,
     directions: Tensor | ArrayLike,
     path: str | os.PathLike[str],
-    *,
-    title: str | None = None,
 ) -> Path:
     """Plot visited states in embedding space, coloured by the direction of their episode.
 
@@ -41,9 +39,6 @@ def embedding(
         embeddings (Tensor or array): φ(s) of visited states [*, k].
         directions (Tensor or array): the direction of each state's episode [*, k].
         path (path-like): path of the PNG.
-
-    Keyword Args:
-        title (str, optional): title of the figure, such as the task.
 
     Raises:
         ValueError: if the shapes differ, or there are fewer than three states.
@@ -75,7 +70,7 @@ def embedding(
         _scatter(axes, points, arrows)
         _wheel(corner, disc=points.shape[1] > 2)
     tidy(axes)
-    axes.set_title(title or "Visited states in embedding space")
+    axes.set_title("Visited states in embedding space")
     return write(figure, path)
 
 

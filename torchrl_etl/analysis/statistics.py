@@ -9,25 +9,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchrl_etl.checks import check_real
 from torchrl_etl.extras import extra
 
 __all__ = ["Interval", "interval", "success_interval"]
+
+_CONFIDENCE = 0.95
 
 # Elements resampled at once, which limits the bootstrap of 10,000 episodes to tens of megabytes.
 _BATCH_ELEMENTS = 4_000_000
 
 
 class Interval(NamedTuple):
-    """A mean and the bounds of its confidence interval."""
+    """A mean and the bounds of its 95 % confidence interval."""
 
     mean: float
     low: float
     high: float
 
 
-def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Mean of ``values`` with a bootstrap confidence interval.
+def interval(values: ArrayLike) -> Interval:
+    """Mean of ``values`` with a 95 % bootstrap confidence interval.
 
     The interval is bias-corrected and accelerated (BCa), or the percentile interval if BCa is
     undefined, as for constant data. Booleans are passed to :func:`success_interval`. Resampling
@@ -35,13 +36,12 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
 
     Args:
         values (array-like): independent numbers, such as one return per seed.
-        confidence (float): in (0, 1). Default: 0.95.
 
     Returns:
         Interval: mean, low, high. For a single value, low and high are NaN.
 
     Raises:
-        ValueError: if there are no values, one is not finite, or the confidence is outside (0, 1).
+        ValueError: if there are no values or one is not finite.
 
     Examples:
         >>> interval([3.0, 3.0, 3.0])
@@ -50,10 +50,9 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
         >>> mean, low < mean < high
         (11.4, True)
     """
-    array = np.asarray(values).ravel()
-    _check(array.size, confidence)
+    array = _checked(values)
     if array.dtype == bool:
-        return success_interval(array, confidence)
+        return success_interval(array)
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
         raise ValueError(
@@ -73,7 +72,7 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
             ends = bootstrap(
                 (array,),
                 np.mean,
-                confidence_level=confidence,
+                confidence_level=_CONFIDENCE,
                 method=method,
                 batch=max(1, _BATCH_ELEMENTS // array.size),
                 rng=np.random.default_rng(0),
@@ -83,26 +82,23 @@ def interval(values: ArrayLike, confidence: float = 0.95) -> Interval:
     return Interval(mean, float(ends.low), float(ends.high))
 
 
-def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.95) -> Interval:
-    """Share of solved episodes with its Wilson score interval.
+def success_interval(solved: Sequence[bool] | np.ndarray) -> Interval:
+    """Share of solved episodes with its 95 % Wilson score interval.
 
     Unlike a bootstrap interval, it has a sensible width if all episodes or none were solved.
 
     Args:
         solved (sequence of bool): one outcome per episode, also as 0 and 1.
-        confidence (float): in (0, 1). Default: 0.95.
 
     Raises:
-        ValueError: if there are no outcomes, one is neither 0 nor 1, or the confidence is outside
-            (0, 1).
+        ValueError: if there are no outcomes or one is neither 0 nor 1.
 
     Examples:
         >>> share, low, high = success_interval([True] * 10)
         >>> share, round(low, 3), high
         (1.0, 0.722, 1.0)
     """
-    array = np.asarray(solved).ravel()
-    _check(array.size, confidence)
+    array = _checked(solved)
     if not np.isin(array, (0, 1)).all():
         raise ValueError(
             "Some outcomes are neither 0 nor 1; pass one boolean per episode, or use interval() "
@@ -111,11 +107,12 @@ def success_interval(solved: Sequence[bool] | np.ndarray, confidence: float = 0.
     with extra("statistics"):
         from scipy.stats import binomtest
     count = int(array.sum())
-    ends = binomtest(count, array.size).proportion_ci(confidence, method="wilson")
+    ends = binomtest(count, array.size).proportion_ci(_CONFIDENCE, method="wilson")
     return Interval(count / array.size, float(ends.low), float(ends.high))
 
 
-def _check(count: int, confidence: float) -> None:
-    if count == 0:
+def _checked(values: ArrayLike) -> np.ndarray:
+    array = np.asarray(values).ravel()
+    if array.size == 0:
         raise ValueError("There are no values to average; pass at least one.")
-    check_real("(0, 1)", confidence=confidence)
+    return array

@@ -15,6 +15,9 @@ from torchrl_etl.synergies.factors import (
 
 __all__ = ["nmf_vaf", "pca_vaf", "variance_accounted_for"]
 
+_PCA_ROWS, _NMF_ROWS = 50_000, 5_000
+"""Maximum numbers of actions to fit; more are subsampled, with a fixed seed."""
+
 
 def variance_accounted_for(
     actions: Tensor | ArrayLike,
@@ -60,17 +63,15 @@ def variance_accounted_for(
     return 1.0 - missed / total
 
 
-def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int = 50_000) -> float:
+def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int) -> float:
     """Variance accounted for by ``num_synergies`` principal components.
 
-    No affine decoder can do better on these actions; a nonlinear one should.
+    No affine decoder can do better on these actions; a nonlinear one should. Of more than 50,000
+    actions, as many are drawn with a fixed seed.
 
     Args:
         actions (Tensor or array): actions [*, n].
         num_synergies (int): number d of principal components.
-
-    Keyword Args:
-        max_samples (int): larger numbers of actions are subsampled, with a fixed seed.
 
     Raises:
         ValueError: if d exceeds the number of actuators or actions, or an action is not finite.
@@ -79,7 +80,7 @@ def pca_vaf(actions: Tensor | ArrayLike, num_synergies: int, *, max_samples: int
         >>> round(pca_vaf([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]], num_synergies=1), 6)
         1.0
     """
-    actions = _subsample(as_matrix(actions, "actions"), max_samples)
+    actions = _subsample(as_matrix(actions, "actions"), _PCA_ROWS)
     _check_rank(num_synergies, actions)
     model = principal_components(actions, num_synergies, svd_solver="covariance_eigh")
     return variance_accounted_for(actions, model.inverse_transform(model.transform(actions)))
@@ -89,22 +90,18 @@ def nmf_vaf(
     actions: Tensor | ArrayLike,
     num_synergies: int,
     low: float | Tensor | ArrayLike = -1.0,
-    *,
-    max_samples: int = 5_000,
 ) -> float:
     """Variance accounted for by non-negative matrix factorization with ``num_synergies`` parts.
 
     NMF is the usual method to extract muscle synergies from recordings. It is fitted to a − low,
     which is never negative. The variance is about the mean action, so that results compare with
-    those of other models. NMF has no offset, so with few parts the result can be negative.
+    those of other models. NMF has no offset, so with few parts the result can be negative. Of more
+    than 5,000 actions, as many are drawn with a fixed seed.
 
     Args:
         actions (Tensor or array): actions [*, n].
         num_synergies (int): number d of parts.
         low (float, Tensor or array): lower action bound, one or [n]. Default: -1.
-
-    Keyword Args:
-        max_samples (int): larger numbers of actions are subsampled, with a fixed seed.
 
     Raises:
         ValueError: if an action is below ``low``, d exceeds the number of actuators or actions, or
@@ -117,7 +114,7 @@ def nmf_vaf(
         >>> round(nmf_vaf(weights @ parts, num_synergies=2, low=0.0), 2)
         1.0
     """
-    actions = _subsample(as_matrix(actions, "actions"), max_samples)
+    actions = _subsample(as_matrix(actions, "actions"), _NMF_ROWS)
     _check_rank(num_synergies, actions)
     shifted = actions - as_array(low)
     if shifted.min() < -1e-4:
