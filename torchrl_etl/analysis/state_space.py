@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_etl.analysis.arrays import as_matrix
 from torchrl_etl.analysis.canvas import direction_colors, new_figure, tidy, write
-from torchrl_etl.extras import extra
+from torchrl_etl.synergies.factors import principal_components
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,14 +94,11 @@ def _histogram(axes: Axes, points: np.ndarray, positive: np.ndarray) -> None:
 def _scatter(axes: Axes, points: np.ndarray, arrows: np.ndarray) -> None:
     labels = ["embedding dimension 1", "embedding dimension 2"]
     if points.shape[1] > 2:
-        with extra("pictures"):
-            from sklearn.decomposition import PCA
-        # A collapsed encoder has zero variance: dividing by it gives NaN.
-        with np.errstate(invalid="ignore"):
-            model = PCA(2, svd_solver="covariance_eigh").fit(points)
+        model = principal_components(points, 2, svd_solver="covariance_eigh")
         points, arrows = model.transform(points), arrows @ model.components_.T
         labels = [
             f"principal component {i + 1} ({share:.0%} of variance)"
+            # A collapsed encoder has no variance, of which each share is NaN.
             for i, share in enumerate(np.nan_to_num(model.explained_variance_ratio_))
         ]
     axes.scatter(*points.T, s=9, c=_colors(*arrows.T), linewidths=0)
