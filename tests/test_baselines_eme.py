@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.data import Bounded
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import Delta, ProbabilisticActor, TanhNormal
 from torchrl.objectives import SoftUpdate
 
 from tests.lookup_tables import Lookup, table, transitions
@@ -105,11 +105,6 @@ class TestEMELoss(LossChecks):
 
 class TestCorrected(TestEMELoss):
     options = {"reward_difference": "corrected", "loss_function": "l2", "subset_share": 1.0}
-
-
-class TestNoTarget(TestEMELoss):
-    options = {"delay_encoder": False}
-    targets = set()
 
 
 # Numbers on lookup tables
@@ -301,13 +296,22 @@ def test_ensemble_variance_is_low_only_on_trained_data() -> None:
         ({"policy_weight": -1.0}, "policy_weight is -1.0"),
         ({"subset_share": 0.0}, "subset_share is 0.0"),
         ({"subset_share": 1.1}, "subset_share is 1.1"),
-        ({"policy_keys": ("mean", "std")}, "the actor writes .*'loc', 'scale'"),
-        ({"policy_keys": ("loc",)}, "name the two keys"),
     ],
 )
 def test_wrong_options_are_refused_at_construction(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         loss_of_tables(**options)
+
+
+def test_actor_without_a_scale_is_refused() -> None:
+    networks = table(*ROWS), predictors(PREDICTIONS)
+    deterministic = ProbabilisticActor(
+        TensorDictModule(nn.Linear(2, 1), in_keys=["observation"], out_keys=["loc"]),
+        in_keys={"param": "loc"},
+        distribution_class=Delta,
+    )
+    with pytest.raises(ValueError, match="it must write its Gaussian's mean"):
+        EMELoss(*networks, deterministic)
 
 
 def test_plain_networks_are_refused() -> None:

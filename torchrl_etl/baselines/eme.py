@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import distance_loss
@@ -81,16 +80,12 @@ class EMELoss(LossModule):
             Default: ``"smooth_l1"``.
         subset_share (float): in (0, 1]; expected share of each batch that a member learns from, its
             own random subset. Members also differ by initialization. Default: ``0.8``.
-        policy_keys (pair of NestedKey): the actor's keys of the Gaussian's mean and standard
-            deviation. Default: ``("loc", "scale")``.
-        delay_encoder (bool): keep a target encoder, which ``SoftUpdate`` updates. Otherwise targets
-            use the current encoder, detached. Default: ``True``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default: ``"mean"``.
 
     Raises:
         ValueError: at construction for an unknown choice, a number out of range, or an actor that
-            does not write ``policy_keys``; in ``forward`` for a batch of one sample, which has no
-            pairs.
+            does not write ``loc`` and ``scale``; in ``forward`` for a batch of one sample, which
+            has no pairs.
         TypeError: if a network is not a TensorDict module, or the actor not a probabilistic one.
 
     Examples:
@@ -137,8 +132,6 @@ class EMELoss(LossModule):
         reward_difference: Literal["sampled", "corrected"] = "sampled",
         loss_function: Literal["smooth_l1", "l2"] = "smooth_l1",
         subset_share: float = 0.8,
-        policy_keys: Sequence[NestedKey] = ("loc", "scale"),
-        delay_encoder: bool = True,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
         check_choice("reward_difference", reward_difference, ("sampled", "corrected"))
@@ -147,11 +140,10 @@ class EMELoss(LossModule):
         check_parts("encoder", encoder, TensorDictModuleBase, outputs=1)
         check_parts("ensemble", ensemble, TensorDictModuleBase, outputs=1)
         check_parts("actor", actor, ProbabilisticTensorDictSequential)
-        policy_keys = [unravel_key(key) for key in policy_keys]
-        if len(policy_keys) != 2 or not set(policy_keys) <= set(actor.out_keys):
+        if not {"loc", "scale"} <= set(actor.out_keys):
             raise ValueError(
-                f"policy_keys is {policy_keys} but the actor writes {list(actor.out_keys)}; name "
-                "the two keys of its Gaussian's mean and standard deviation."
+                f"The actor writes {list(actor.out_keys)}; it must write its Gaussian's mean and "
+                "standard deviation as loc and scale, as make_actor's does."
             )
         check_real("[0, 1)", gamma=gamma)  # for distances to be finite
         check_real("[0, inf)", policy_weight=policy_weight)
@@ -160,11 +152,11 @@ class EMELoss(LossModule):
         super().__init__()
         self.gamma, self.policy_weight, self.subset_share = gamma, policy_weight, subset_share
         self.reward_difference, self.loss_function = reward_difference, loss_function
-        self.reduction, self.policy_keys = reduction, policy_keys
+        self.reduction = reduction
         # In a tuple, so that the actor is no submodule: training, saving, casting or resetting the
         # loss leaves it alone.
         self._actor = (actor,)
-        self.convert_to_functional(encoder, "encoder", create_target_params=delay_encoder)
+        self.convert_to_functional(encoder, "encoder", create_target_params=True)
         self.convert_to_functional(ensemble, "ensemble")
         self._set_in_keys()
         self.out_keys = [
@@ -243,7 +235,7 @@ class EMELoss(LossModule):
             difference = (difference.square() - noise).clamp_min(0.0).sqrt()
         return difference
 
-    def _gaussian(self, tensordict: TensorDictBase, like: Tensor) -> list[Tensor]:
+    def _gaussian(self, tensordict: TensorDictBase, like: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation [samples, n] of the actor below its tanh.
 
         An invertible map of both Gaussians does not change their divergence, so the tanh and the
@@ -255,4 +247,5 @@ class EMELoss(LossModule):
         entries = {key: tensordict.get(key).to(parameter) for key in self.actor.in_keys}
         inputs = TensorDict(entries, tensordict.batch_size)
         written = self.actor.get_dist_params(inputs)
-        return [written.get(key).flatten(0, -2).to(like) for key in self.policy_keys]
+        loc, scale = (written.get(key).flatten(0, -2).to(like) for key in ("loc", "scale"))
+        return loc, scale
