@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import GymEnv, RenameTransform, TransformedEnv
 
+import torchrl_etl.envs  # noqa: F401  (registers the environment)
 from torchrl_etl.modules import GMVAE, StateEncoder, SynergyDecoder, make_actor, make_critic
 from torchrl_etl.objectives import (
     BehavioralMetricLoss,
