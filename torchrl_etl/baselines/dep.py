@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.modules.scheduled import Scheduled
+from torchrl_etl.objectives.checks import read
 
 __all__ = ["DEPController", "DEPExploration"]
 
@@ -290,13 +291,8 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
 
     def _lengths(self, tensordict: TensorDictBase) -> Tensor:
         """Muscle lengths [rows, n]."""
-        lengths = tensordict.get(self.length_key, None)
-        if lengths is None:
-            raise KeyError(
-                f"DEPExploration reads {self.length_key!r}, but the tensordict has only "
-                f"{sorted(map(str, tensordict.keys(True, True)))}; build the environment with "
-                "make_env(..., muscle_lengths=True)."
-            )
+        cure = "build the environment with make_env(..., muscle_lengths=True)"
+        lengths = read("DEPExploration", tensordict, self.length_key, cure=cure)
         if lengths.shape[-1] != len(self.low):
             raise ValueError(
                 f"{self.length_key!r} has {lengths.shape[-1]} entries for {len(self.low)} "

@@ -12,8 +12,10 @@ from torch import Tensor, nn
 __all__ = ["check_parts", "read", "warn_of_previous_action"]
 
 
-def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) -> Tensor:
-    """Get an entry, or raise a ``KeyError`` that names it and, for an action, where to find it.
+def read(
+    reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str, cure: str = ""
+) -> Tensor:
+    """Get an entry, or raise a ``KeyError`` that names it and how to get it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -25,15 +27,14 @@ def read(reader: str, tensordict: TensorDictBase, key: NestedKey, *prefix: str) 
     value = tensordict.get(key, None)
     if value is None:
         there = tensordict.keys(True, True)
-        cure = ""
-        if key == "action" and ("next", "executed_action") in there:
+        if not cure and key == "action" and ("next", "executed_action") in there:
             cure = (
-                "; RenameTransform([('next', 'executed_action')], ['action'], create_copy=True) "
+                "RenameTransform([('next', 'executed_action')], ['action'], create_copy=True) "
                 "makes one from the executed action"
             )
         raise KeyError(
             f"{reader} reads {unravel_key((*prefix, key))!r}, which the data lacks; there it has "
-            f"{', '.join(sorted(map(str, there)))}{cure}."
+            f"{', '.join(sorted(map(str, there)))}{cure and f'; {cure}'}."
         )
     return value
 

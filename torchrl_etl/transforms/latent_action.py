@@ -16,6 +16,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import ModuleTransform, Transform, TransformedEnv
 
+from torchrl_etl.objectives.checks import read
 from torchrl_etl.transforms.keys import (
     check_network,
     group_shape,
@@ -140,15 +141,10 @@ class LatentAction(ModuleTransform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:
             raise self._outside_an_env()
-        latent = tensordict.get(self.latent_key, None)
-        if latent is None:
-            if self.missing_tolerance:
-                return tensordict
-            raise KeyError(
-                f"{type(self).__name__} reads {self.latent_key!r}, but the tensordict has only "
-                f"{sorted(map(str, tensordict.keys(True, True)))}; let the policy write it."
-            )
-        action = self.decode(latent)
+        if self.missing_tolerance and tensordict.get(self.latent_key, None) is None:
+            return tensordict
+        cure = "let the policy write it"
+        action = self.decode(read(type(self).__name__, tensordict, self.latent_key, cure=cure))
         tensordict.set(self.action_key, action)
         return tensordict.set(self._decoded_copy, action)
 

@@ -8,6 +8,7 @@ from tensordict.utils import expand_as_right, unravel_key
 from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_real
+from torchrl_etl.objectives.checks import read
 from torchrl_etl.transforms.direction import DirectionPrimer
 
 __all__ = ["RedrawDirection"]
@@ -56,17 +57,13 @@ class RedrawDirection(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (key,) = self.in_keys
-        followed = tensordict.get(key, None)
-        if followed is None or tensordict.get(unravel_key(("next", key)), None) is None:
-            raise KeyError(
-                f"RedrawDirection reads {key!r} and {unravel_key(('next', key))!r}, but the "
-                f"tensordict has only {sorted(map(str, tensordict.keys(True, True)))}."
-            )
+        following = unravel_key(("next", key))
+        followed, _ = (read("RedrawDirection", tensordict, each) for each in (key, following))
         shape = followed.shape[:-1]  # in a group of agents, one each
         drawn = self.primer.draw(shape, followed.device)
         again = torch.rand(shape, device=followed.device) < self.share
         direction = torch.where(expand_as_right(again, drawn), drawn, followed)
-        return tensordict.set(key, direction).set(unravel_key(("next", key)), direction.clone())
+        return tensordict.set(key, direction).set(following, direction.clone())
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError(
