@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -30,7 +29,6 @@ def replaced(
     rows: int = 2,
     *,
     episode: int | None = None,
-    ids: bool = False,
     kind: ExplorationType | None = ExplorationType.RANDOM,
 ) -> Tensor:
     """Whether the module replaced the policy's actions: [steps, rows]."""
@@ -38,9 +36,7 @@ def replaced(
     for step in range(steps):
         td = TensorDict({"muscle_length": torch.rand(rows, MUSCLES)}, [rows])
         td["action"] = torch.full((rows, MUSCLES), POLICY_ACTION)
-        if episode is not None and ids:
-            td["collector", "traj_ids"] = torch.arange(rows) + rows * (step // episode)
-        elif episode is not None:
+        if episode is not None:
             td["is_init"] = torch.full((rows, 1), step % episode == 0)
         with set_exploration_type(kind):
             batches.append(module(td)["action"])
@@ -87,11 +83,9 @@ def test_bursts_begin_with_the_given_probability() -> None:
     assert abs(begins / policys - p) < 3 * math.sqrt(p / policys)
 
 
-@pytest.mark.parametrize("ids", [False, True])
-def test_every_third_episode_is_the_policys(ids: bool) -> None:
-    key = ("collector", "traj_ids") if ids else "is_init"
-    module = DEPExploration(SPEC, dep_frames=0, probability=0.5, episode_key=key)
-    acted = replaced(module, 9 * 20, episode=20, ids=ids).view(9, 20, 2)
+def test_every_third_episode_is_the_policys() -> None:
+    module = DEPExploration(SPEC, dep_frames=0, probability=0.5)
+    acted = replaced(module, 9 * 20, episode=20).view(9, 20, 2)
     for episode in range(9):
         assert acted[episode].any(0).all() == (episode % 3 != 2), episode
         assert not acted[episode, 0].any()  # a burst ends with its episode
@@ -101,7 +95,7 @@ def test_initial_dep_frames_include_the_third_episode() -> None:
     assert replaced(DEPExploration(SPEC, dep_frames=10_000), 40, episode=10).all()
 
 
-def test_without_an_episode_entry_all_steps_are_one_episode() -> None:
+def test_without_is_init_all_steps_are_one_episode() -> None:
     module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=2)
     assert replaced(module, 20).any()
     module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=1)
@@ -172,7 +166,7 @@ def test_batch_shapes_and_nested_keys(batch: tuple[int, ...]) -> None:
         SPEC,
         action_key=("agent", "action"),
         length_key=("agent", "length"),
-        episode_key=("agent", "begins"),
+        init_key=("agent", "begins"),
     )
     assert module.in_keys == [("agent", "length"), ("agent", "action"), ("agent", "begins")]
     assert module.out_keys == [("agent", "action")]
@@ -268,16 +262,14 @@ def test_missing_or_wrong_muscle_lengths_are_refused() -> None:
 @pytest.mark.parametrize("collector_class", [Collector, VectorCollector])
 def test_collector_records_deps_actions(collector_class: type[Collector]) -> None:
     env = make_env("myoHandPose", num_envs=2, seed=0, muscle_lengths=True)
-    key: Any = ("collector", "traj_ids")
-    if collector_class is Collector:
-        env, key = TransformedEnv(env, InitTracker()), "is_init"
+    env = TransformedEnv(env, InitTracker())
     spec = env.full_action_spec_unbatched["action"]
     constant = TensorDictModule(
         lambda observation: observation.new_full((*observation.shape[:-1], 39), POLICY_ACTION),
         in_keys=["observation"],
         out_keys=["action"],
     )
-    dep = DEPExploration(spec, dep_frames=40, probability=0.0, episode_key=key)
+    dep = DEPExploration(spec, dep_frames=40, probability=0.0)
     policy = TensorDictSequential(constant, dep)
     collector = collector_class(env, policy, frames_per_batch=210, total_frames=210)
     try:

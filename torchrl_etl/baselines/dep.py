@@ -181,15 +181,13 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         policy_every (int): every how many episodes of a row one is the policy's alone. Default: 3.
         action_key (NestedKey): Default: ``"action"``.
         length_key (NestedKey): Default: ``"muscle_length"``.
-        episode_key (NestedKey, optional): marks where an episode begins: a boolean that is true at
-            its first step, as from TorchRL's ``InitTracker``, or an integer that differs between
-            episodes, such as a collector's ``("collector", "traj_ids")``. Default: ``"is_init"``.
-            Without the entry, all steps are one episode.
+        init_key (NestedKey): see :class:`torchrl.envs.InitTracker`. Without the entry, all steps
+            are one episode. Default: ``"is_init"``.
         **controller: see :class:`DEPController`; the defaults are the paper's for legs.
 
     Keys:
-        reads ``muscle_length`` [*, n], ``action`` [*, n] and, where present, ``is_init`` [*, 1] or
-        episode numbers [*]; writes ``action`` [*, n] in the bounds of the spec.
+        reads ``muscle_length`` [*, n], ``action`` [*, n] and, where present, ``is_init`` [*, 1];
+        writes ``action`` [*, n] in the bounds of the spec.
 
     Raises:
         TypeError: if the spec is not bounded, or for an unknown setting.
@@ -226,7 +224,7 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         policy_every: int = 3,
         action_key: NestedKey = "action",
         length_key: NestedKey = "muscle_length",
-        episode_key: NestedKey | None = "is_init",
+        init_key: NestedKey = "is_init",
         **controller: Any,
     ) -> None:
         if not isinstance(action_spec, Bounded):
@@ -246,9 +244,8 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         self.dep_frames, self.probability = dep_frames, probability
         self.intervention_length, self.policy_every = intervention_length, policy_every
         self.action_key, self.length_key = unravel_key(action_key), unravel_key(length_key)
-        self.episode_key = None if episode_key is None else unravel_key(episode_key)
-        keys = (self.length_key, self.action_key, self.episode_key)
-        self.in_keys = [key for key in keys if key is not None]
+        self.init_key = unravel_key(init_key)
+        self.in_keys = [self.length_key, self.action_key, self.init_key]
         self.out_keys = [self.action_key]
         self.register_buffer("low", action_spec.space.low.clone(), persistent=False)
         self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
@@ -266,7 +263,6 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         )
         self._burst_left = torch.zeros(rows, device=device, dtype=torch.long)
         self._episode = torch.zeros(rows, device=device, dtype=torch.long)  # the first is 1
-        self._name: Tensor | None = None
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -301,15 +297,10 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         return lengths.reshape(-1, len(self.low))
 
     def _begin_episodes(self, tensordict: TensorDictBase) -> None:
-        entry = None if self.episode_key is None else tensordict.get(self.episode_key, None)
         begins = self._episode == 0
-        if entry is not None:
-            entry = entry.reshape(-1)
-            if entry.dtype is torch.bool:
-                begins = begins | entry
-            elif self._name is not None:
-                begins = begins | (entry != self._name)
-            self._name = entry.clone()
+        is_init = tensordict.get(self.init_key, None)
+        if is_init is not None:
+            begins = begins | is_init.reshape(-1)
         self._episode += begins
         self._burst_left[begins] = 0
         self.controller.reset(begins)
