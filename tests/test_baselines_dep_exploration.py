@@ -56,15 +56,15 @@ def run_lengths(replaced: Tensor) -> list[int]:
 
 
 def test_dep_acts_alone_for_its_frames_and_the_policy_afterwards() -> None:
-    module = DEPExploration(SPEC, dep_frames=20, probability=0.0)
+    module = DEPExploration(SPEC, dep_actions=20, probability=0.0)
     acted = replaced(module, 30, rows=2)
     assert acted[:10].all() and not acted[10:].any()
-    assert module.frames == 60
+    assert module.seen == 60
 
 
 @pytest.mark.parametrize("length", [1, 5])
 def test_bursts_last_exactly_intervention_length(length: int) -> None:
-    module = DEPExploration(SPEC, dep_frames=0, probability=0.1, intervention_length=length)
+    module = DEPExploration(SPEC, dep_actions=0, probability=0.1, intervention_length=length)
     acted = replaced(module, 400, rows=3)
     for row in acted.T:
         runs = run_lengths(row)
@@ -77,28 +77,28 @@ def test_bursts_last_exactly_intervention_length(length: int) -> None:
 def test_bursts_begin_with_the_given_probability() -> None:
     """Bursts per step of the policy are the probability p, within 3 sigma."""
     p, rows, steps = 0.02, 50, 300
-    acted = replaced(DEPExploration(SPEC, dep_frames=0, probability=p), steps, rows)
+    acted = replaced(DEPExploration(SPEC, dep_actions=0, probability=p), steps, rows)
     begins = (acted[1:] & ~acted[:-1]).sum().item()
     policys = (~acted).sum().item()
     assert abs(begins / policys - p) < 3 * math.sqrt(p / policys)
 
 
 def test_every_third_episode_is_the_policys() -> None:
-    module = DEPExploration(SPEC, dep_frames=0, probability=0.5)
+    module = DEPExploration(SPEC, dep_actions=0, probability=0.5)
     acted = replaced(module, 9 * 20, episode=20).view(9, 20, 2)
     for episode in range(9):
         assert acted[episode].any(0).all() == (episode % 3 != 2), episode
         assert not acted[episode, 0].any()  # a burst ends with its episode
 
 
-def test_initial_dep_frames_include_the_third_episode() -> None:
-    assert replaced(DEPExploration(SPEC, dep_frames=10_000), 40, episode=10).all()
+def test_initial_dep_actions_include_the_third_episode() -> None:
+    assert replaced(DEPExploration(SPEC, dep_actions=10_000), 40, episode=10).all()
 
 
 def test_without_is_init_all_steps_are_one_episode() -> None:
-    module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=2)
+    module = DEPExploration(SPEC, dep_actions=0, probability=1.0, policy_every=2)
     assert replaced(module, 20).any()
-    module = DEPExploration(SPEC, dep_frames=0, probability=1.0, policy_every=1)
+    module = DEPExploration(SPEC, dep_actions=0, probability=1.0, policy_every=1)
     assert not replaced(module, 20).any()
 
 
@@ -106,11 +106,11 @@ def test_without_is_init_all_steps_are_one_episode() -> None:
 def test_dep_is_inactive_unless_exploration_is_random(
     kind: ExplorationType | None,
 ) -> None:
-    module = DEPExploration(SPEC, dep_frames=100)
+    module = DEPExploration(SPEC, dep_actions=100)
     replaced(module, 10)
     before = copy.deepcopy(vars(module.controller))
     assert not replaced(module, 5, rows=7, kind=kind).any()
-    assert module.frames == 20
+    assert module.seen == 20
     for name, value in vars(module.controller).items():
         if isinstance(value, Tensor):
             assert torch.equal(value, before[name]), name
@@ -120,10 +120,10 @@ def test_dep_is_inactive_unless_exploration_is_random(
 
 def test_controller_adapts_while_the_policy_acts() -> None:
     """The action of a burst is that of a controller that saw every step."""
-    module = DEPExploration(SPEC, dep_frames=0, probability=0.0)
+    module = DEPExploration(SPEC, dep_actions=0, probability=0.0)
     alone = DEPController(2, MUSCLES)
     for step in range(30):
-        module.dep_frames = 0 if step < 29 else 1_000
+        module.dep_actions = 0 if step < 29 else 1_000
         td = TensorDict({"muscle_length": torch.rand(2, MUSCLES)}, [2])
         td["action"] = torch.full((2, MUSCLES), POLICY_ACTION)
         command = alone.step(td["muscle_length"])
@@ -133,7 +133,7 @@ def test_controller_adapts_while_the_policy_acts() -> None:
 
 
 def test_first_step_of_an_episode_records_no_movement() -> None:
-    module = DEPExploration(SPEC, dep_frames=0)
+    module = DEPExploration(SPEC, dep_actions=0)
     replaced(module, 11, episode=10)
     assert not module.controller.moves[:, 0].any()
     replaced(module, 1)
@@ -156,7 +156,7 @@ def test_same_seed_same_actions() -> None:
     seen = []
     for _ in range(2):
         torch.manual_seed(3)
-        seen.append(replaced(DEPExploration(SPEC, dep_frames=0, probability=0.1), 50))
+        seen.append(replaced(DEPExploration(SPEC, dep_actions=0, probability=0.1), 50))
     assert torch.equal(*seen)
 
 
@@ -189,7 +189,7 @@ def test_rows_are_independent() -> None:
     seen = []
     for series in (lengths, others):
         torch.manual_seed(1)
-        module = DEPExploration(SPEC, dep_frames=60, probability=0.2)
+        module = DEPExploration(SPEC, dep_actions=60, probability=0.2)
         actions = []
         for entry in series:
             td = TensorDict({"muscle_length": entry, "action": torch.zeros_like(entry)}, [3])
@@ -201,11 +201,11 @@ def test_rows_are_independent() -> None:
 
 
 def test_new_batch_size_resets_the_controller_and_keeps_the_frame_count() -> None:
-    module = DEPExploration(SPEC, dep_frames=20, probability=0.0)
+    module = DEPExploration(SPEC, dep_actions=20, probability=0.0)
     replaced(module, 10, rows=2)
     assert module.controller.moves.any()
     assert not replaced(module, 1, rows=3).any()  # the initial frames of DEP are over
-    assert module.controller.rows == 3 and module.frames == 23
+    assert module.controller.rows == 3 and module.seen == 23
     assert not module.controller.moves.any()
 
 
@@ -215,10 +215,10 @@ def test_state_dict_excludes_memory_and_copies_are_independent() -> None:
     assert not module.state_dict() and not list(module.parameters())
     other = copy.deepcopy(module)
     replaced(other, 5)
-    assert (module.frames, other.frames) == (20, 30)
+    assert (module.seen, other.seen) == (20, 30)
     before = module.controller.moves
     module.load_state_dict(DEPExploration(SPEC).state_dict())
-    assert torch.equal(module.controller.moves, before) and module.frames == 20
+    assert torch.equal(module.controller.moves, before) and module.seen == 20
 
 
 def test_module_follows_device_and_dtype() -> None:
@@ -238,7 +238,7 @@ def test_bad_specs_and_settings_are_refused() -> None:
         DEPExploration(Bounded(0, 1, shape=(2, 3)))
     with pytest.raises(TypeError, match="kapa"):
         DEPExploration(SPEC, kapa=3)
-    for settings in ({"probability": 1.5}, {"probability": -0.1}, {"dep_frames": -1}):
+    for settings in ({"probability": 1.5}, {"probability": -0.1}, {"dep_actions": -1}):
         with pytest.raises(ValueError, match=rf"{next(iter(settings))} is -?[\d.]+; it must be"):
             DEPExploration(SPEC, **settings)
     for settings in ({"intervention_length": 0}, {"policy_every": 0}):
@@ -269,7 +269,7 @@ def test_collector_records_deps_actions(collector_class: type[Collector]) -> Non
         in_keys=["observation"],
         out_keys=["action"],
     )
-    dep = DEPExploration(spec, dep_frames=40, probability=0.0)
+    dep = DEPExploration(spec, dep_actions=40, probability=0.0)
     policy = TensorDictSequential(constant, dep)
     collector = collector_class(env, policy, frames_per_batch=210, total_frames=210)
     try:
@@ -279,7 +279,7 @@ def test_collector_records_deps_actions(collector_class: type[Collector]) -> Non
     assert (batch["action"][:, :20] != POLICY_ACTION).all()
     assert (batch["action"][:, 20:] == POLICY_ACTION).all()
     assert batch["action"][:, 10:20].abs().mean() > 0.5  # DEP drives muscles to their ends
-    assert dep._episode.tolist() == [2, 2] and dep.frames == 210  # episodes are 100 steps long
+    assert dep._episode.tolist() == [2, 2] and dep.seen == 210  # episodes are 100 steps long
 
 
 def test_dep_leaves_the_gradient_of_the_actor_intact() -> None:

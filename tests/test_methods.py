@@ -284,7 +284,7 @@ def test_dep_learning_starts_after_dep_frames_unless_set(starts, expected, tmp_p
     experiment = Experiment(run)
     stage = experiment.method.stage()
     assert stage.learning_starts == experiment.config.learn.learning_starts == expected
-    assert controller(stage).dep_frames == 640 // 2 // 2  # actions of each worker
+    assert controller(stage).dep_actions == 640 // 2 // 2  # actions of each worker
 
 
 @pytest.mark.slow
@@ -292,9 +292,9 @@ def test_dep_action_count_survives_a_restart_of_collection(tmp_path):
     stage = Experiment(rival("dep", tmp_path / "run", "action_repeat=2")).method.stage()
     stage.restart_collection()
     actions = stage.collect().numel()
-    assert stage.frames == 2 * actions and controller(stage).frames == actions
+    assert stage.frames == 2 * actions and controller(stage).seen == actions
     stage.restart_collection()
-    assert controller(stage).frames == actions
+    assert controller(stage).seen == actions
     stage.close()
 
 

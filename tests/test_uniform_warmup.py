@@ -32,8 +32,8 @@ def test_deterministic_actions_are_unchanged_and_not_counted():
     assert warmup.seen == 0
 
 
-def test_a_negative_number_of_frames_is_refused():
-    with pytest.raises(ValueError, match="frames is -1"):
+def test_a_negative_number_of_actions_is_refused():
+    with pytest.raises(ValueError, match="actions is -1"):
         UniformWarmup(Bounded(-1, 1, shape=(2,)), -1)
 
 
@@ -55,7 +55,7 @@ def test_a_resumed_stage_does_not_warm_up_again():
     stage.progress.frames = 64
     stage.restart_collection()
     warmup = next(m for m in stage.learner.behavior.modules() if isinstance(m, UniformWarmup))
-    assert warmup.seen == warmup.frames == 64
+    assert warmup.seen == warmup.actions == 64
     stage.close()
 
 

@@ -154,12 +154,12 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
     r"""Replaces some of a policy's actions by those of a :class:`DEPController`.
 
     Put it after the actor: ``TensorDictSequential(actor, DEPExploration(action_spec))``. DEP acts
-    alone for ``dep_frames`` frames. Later, each step of the policy may start a short burst of DEP's
-    actions, except in every ``policy_every``-th episode. DEP adapts at every step.
+    alone for the first ``dep_actions`` actions. Later, each step of the policy may start a short
+    burst of DEP's actions, except in every ``policy_every``-th episode. DEP adapts at every step.
 
     Its state is in neither the tensordict nor the ``state_dict()``, so new weights leave a worker's
     state alone. Row i of a batch must be the same body at every call, as in a collector; another
-    number of rows resets everything but :attr:`frames`. Random numbers come from torch's global
+    number of rows resets everything but :attr:`seen`. Random numbers come from torch's global
     generator. It acts and adapts where exploration is set to random, as in collectors. Otherwise
     (deterministic exploration, or outside :class:`torchrl.envs.set_exploration_type`) actions pass
     unchanged and it does not adapt.
@@ -174,7 +174,7 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         action_spec (Bounded): the action's leaf, unbatched.
 
     Keyword Args:
-        dep_frames (int): frames in which DEP acts alone, summed over the rows of this worker.
+        dep_actions (int): actions in which DEP acts alone, of all rows of this worker together.
             Default: 200000.
         probability (float): probability of a burst at each step of the policy. Default: 4e-4.
         intervention_length (int): steps of a burst. Default: 5.
@@ -211,14 +211,14 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
                 [0.5000, 0.5000, 0.5000, 0.5000]])
     """
 
-    frames: int
-    """Frames seen so far; :meth:`restart` sets it."""
+    seen: int
+    """Actions counted so far; :meth:`restart` sets it."""
 
     def __init__(
         self,
         action_spec: Bounded,
         *,
-        dep_frames: int = 200_000,
+        dep_actions: int = 200_000,
         probability: float = 4e-4,
         intervention_length: int = 5,
         policy_every: int = 3,
@@ -238,10 +238,10 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
                 "the unbatched one, such as env.full_action_spec_unbatched['action']."
             )
         check_integer(1, intervention_length=intervention_length, policy_every=policy_every)
-        check_integer(0, dep_frames=dep_frames)
+        check_integer(0, dep_actions=dep_actions)
         check_real("[0, 1]", probability=probability)
         super().__init__()
-        self.dep_frames, self.probability = dep_frames, probability
+        self.dep_actions, self.probability = dep_actions, probability
         self.intervention_length, self.policy_every = intervention_length, policy_every
         self.action_key, self.length_key = unravel_key(action_key), unravel_key(length_key)
         self.init_key = unravel_key(init_key)
@@ -249,11 +249,11 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         self.out_keys = [self.action_key]
         self.register_buffer("low", action_spec.space.low.clone(), persistent=False)
         self.register_buffer("high", action_spec.space.high.clone(), persistent=False)
-        self.frames, self._settings = 0, controller
+        self.seen, self._settings = 0, controller
         self._start(torch.empty(0, action_spec.shape[0]))
 
     def restart(self, actions: int) -> None:
-        self.frames = actions
+        self.seen = actions
 
     def _start(self, lengths: Tensor) -> None:
         # Not buffers: a collector's weight update would overwrite them with the learner's.
@@ -277,7 +277,7 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
         self._begin_episodes(tensordict)
         is_dep = self._is_dep()
         command = self.controller.step(lengths)
-        self.frames += len(lengths)
+        self.seen += len(lengths)
 
         action = tensordict.get(self.action_key)
         dep_action = self.low + (command.to(self.low) + 1) / 2 * (self.high - self.low)
@@ -308,7 +308,7 @@ class DEPExploration(TensorDictModuleBase, Scheduled):
     def _is_dep(self) -> Tensor:
         """Whether DEP acts [rows]; where it does not, also draws whether a burst begins next."""
         bursting = self._burst_left > 0
-        if self.frames < self.dep_frames:
+        if self.seen < self.dep_actions:
             return torch.ones_like(bursting)
         alone = self._episode % self.policy_every == 0
         draw = torch.rand(len(bursting), device=bursting.device) < self.probability

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensordict.nn import TensorDictSequential
 
 from torchrl_etl.baselines import DEPExploration
-from torchrl_etl.checks import naming
+from torchrl_etl.checks import check_integer, naming
 from torchrl_etl.methods.method import Method
 from torchrl_etl.training.stage import Stage
 
@@ -20,8 +20,8 @@ class DEP(Method):
 
     Deviates: the authors' learner is MPO; here it is SAC, as for all methods.
 
-    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, except that
-    ``dep_frames`` counts the frames of all workers.
+    Options: keyword arguments of :class:`~torchrl_etl.baselines.DEPExploration`, with
+    ``dep_frames``, frames of all workers, for ``dep_actions``.
     """
 
     takes = (
@@ -31,9 +31,12 @@ class DEP(Method):
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")
+        options = dict(self.options)
+        frames = options.pop("dep_frames")
         with naming("method.options"):
-            controller = DEPExploration(self.context.spec.action_spec, **self.options)
-        controller.dep_frames = self.context.actions(self.options["dep_frames"])
+            check_integer(0, dep_frames=frames)
+            options["dep_actions"] = self.context.actions(frames)
+            controller = DEPExploration(self.context.spec.action_spec, **options)
         actor = self.context.actor()
         behavior = TensorDictSequential(self.context.behavior(actor), controller)
         learner = self.context.learner(actor, behavior=behavior)

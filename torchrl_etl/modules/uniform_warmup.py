@@ -17,7 +17,7 @@ __all__ = ["UniformWarmup"]
 
 
 class UniformWarmup(TensorDictModuleBase, Scheduled):
-    """Replaces a policy's first ``frames`` actions by uniform ones.
+    """Replaces a policy's first ``actions`` actions by uniform ones.
 
     Put it after the actor: ``TensorDictSequential(actor, UniformWarmup(action_spec, 10_000))``.
     ``init_random_frames`` of TorchRL's collectors draws *environment* actions and restarts when a
@@ -27,7 +27,7 @@ class UniformWarmup(TensorDictModuleBase, Scheduled):
 
     Args:
         action_spec (Bounded): the actor's output, unbatched.
-        frames (int): number of actions to replace, summed over all rows.
+        actions (int): number of actions to replace, of all rows together.
 
     Keyword Args:
         action_key (NestedKey): Default: ``"action"``.
@@ -36,7 +36,7 @@ class UniformWarmup(TensorDictModuleBase, Scheduled):
         reads and writes ``action`` [*, n], within the bounds of the spec.
 
     Raises:
-        ValueError: if frames is negative, or the spec has no finite bounds.
+        ValueError: if actions is negative, or the spec has no finite bounds.
 
     Examples:
         >>> import torch
@@ -44,7 +44,7 @@ class UniformWarmup(TensorDictModuleBase, Scheduled):
         >>> from torchrl.data import Bounded
         >>> from torchrl.envs import ExplorationType, set_exploration_type
         >>> from torchrl_etl.modules import UniformWarmup
-        >>> warmup = UniformWarmup(Bounded(0, 1, shape=(2,)), frames=3)
+        >>> warmup = UniformWarmup(Bounded(0, 1, shape=(2,)), actions=3)
         >>> data = TensorDict({"action": torch.full((3, 2), 7.0)}, [3])
         >>> with set_exploration_type(ExplorationType.RANDOM):
         ...     first, second = warmup(data.clone())["action"], warmup(data.clone())["action"]
@@ -56,12 +56,12 @@ class UniformWarmup(TensorDictModuleBase, Scheduled):
     """Actions counted so far; :meth:`restart` sets it."""
 
     def __init__(
-        self, action_spec: Bounded, frames: int, *, action_key: NestedKey = "action"
+        self, action_spec: Bounded, actions: int, *, action_key: NestedKey = "action"
     ) -> None:
-        check_integer(0, frames=frames)
+        check_integer(0, actions=actions)
         low, high = bounds_of(action_spec)
         super().__init__()
-        self.frames, self.seen = frames, 0
+        self.actions, self.seen = actions, 0
         self.action_key = unravel_key(action_key)
         self.in_keys = self.out_keys = [self.action_key]
         self.register_buffer("low", low.clone(), persistent=False)
@@ -72,7 +72,7 @@ class UniformWarmup(TensorDictModuleBase, Scheduled):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if exploration_type() is not ExplorationType.RANDOM or self.seen >= self.frames:
+        if exploration_type() is not ExplorationType.RANDOM or self.seen >= self.actions:
             return tensordict
         action = tensordict.get(self.action_key)
         self.seen += action.shape[:-1].numel()
