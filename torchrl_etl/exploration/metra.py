@@ -34,10 +34,9 @@ class METRAExploration(DirectionExploration):
         **directions: Any,
     ) -> None:
         super().__init__(spec, **directions)
-        self._lr, self._metra = lr, dict(metra)
+        with naming("metra"):
+            loss = METRALoss(self.encoder, **metra).to(spec.device)
+        self._term = Term(loss, lr=lr)
 
     def terms(self) -> Sequence[Term]:
-        device = next(self.encoder.parameters()).device
-        with naming("metra"):
-            loss = METRALoss(self.encoder, **self._metra).to(device)
-        return (Term(loss, lr=self._lr),)
+        return (self._term,)

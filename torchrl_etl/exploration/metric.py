@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchrl_etl.checks import check_flag, check_real, naming
@@ -33,20 +33,19 @@ class MetricExploration(DirectionExploration):
         *,
         lr: float | None,
         tau: float,
-        metric: dict[str, Any],
+        metric: Mapping[str, Any],
         **directions: Any,
     ) -> None:
         super().__init__(spec, **directions)
         check_real("(0, 1]", tau=tau)  # Term also allows None, for no targets
-        check_flag(**{"metric.delay_encoder": metric.get("delay_encoder", True)})
-        self._lr, self._tau, self._metric = lr, tau, dict(metric)
+        delays = metric.get("delay_encoder", True)
+        check_flag(**{"metric.delay_encoder": delays})
+        dynamics = None
+        if metric.get("divergence") == "gaussian":
+            dynamics = GaussianDynamics(self.encoder.embedding_dim)
+        with naming("metric"):
+            loss = BehavioralMetricLoss(self.encoder, dynamics, **metric).to(spec.device)
+        self._term = Term(loss, lr=lr, tau=tau if delays else None)
 
     def terms(self) -> Sequence[Term]:
-        dynamics = None
-        if self._metric.get("divergence") == "gaussian":
-            dynamics = GaussianDynamics(self.encoder.embedding_dim)
-        device = next(self.encoder.parameters()).device
-        with naming("metric"):
-            loss = BehavioralMetricLoss(self.encoder, dynamics, **self._metric).to(device)
-        tau = self._tau if self._metric.get("delay_encoder", True) else None
-        return (Term(loss, lr=self._lr, tau=tau),)
+        return (self._term,)

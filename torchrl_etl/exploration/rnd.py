@@ -55,7 +55,8 @@ class RNDExploration(Exploration):
         )
         statistics = RunningMeanStd((spec.observation_dim,))
         loss = RNDLoss(predictor, target, obs_rms=statistics, update_fraction=1.0)
-        self.loss, self._lr = loss.to(spec.device), lr
+        self.loss = loss.to(spec.device)
+        self._term = Term(self.loss, lr=lr)
         with naming("bonus"):
             self._bonus = RNDBonus(self.loss, **bonus)
 
@@ -63,4 +64,4 @@ class RNDExploration(Exploration):
         return (self._bonus,)
 
     def terms(self) -> Sequence[Term]:
-        return (Term(self.loss, lr=self._lr),)
+        return (self._term,)
