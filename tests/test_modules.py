@@ -80,17 +80,20 @@ def test_from_spec_takes_size_and_bounds() -> None:
             GMVAE.from_spec(wrong, 2)
 
 
-@pytest.mark.parametrize("spec", [Unbounded((2,)), Bounded(-3e38, 3e38, shape=(2,))])
+@pytest.mark.parametrize(
+    "spec", [Unbounded((2,)), Bounded(-3e38, 3e38, shape=(2,)), Bounded(1, 1, shape=(2,))]
+)
 @pytest.mark.parametrize(
     "make",
     [
         lambda spec: GMVAE.from_spec(spec, 1),
         lambda spec: make_actor({"observation": 3}, spec),
+        lambda spec: make_lattice_actor({"observation": 3}, spec),
         lambda spec: UniformWarmup(spec, 3),
     ],
 )
-def test_bounds_without_a_finite_range_are_refused(make: Any, spec: Any) -> None:
-    with pytest.raises(ValueError, match="without finite bounds; pass the bounded leaf"):
+def test_bounds_out_of_order_or_without_a_finite_range_are_refused(make: Any, spec: Any) -> None:
+    with pytest.raises(ValueError, match="without finite, ascending bounds; pass the bounded"):
         make(spec)
 
 

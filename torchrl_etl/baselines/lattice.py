@@ -40,10 +40,7 @@ class LatticeNormal(D.TransformedDistribution):
         scale_tril (Tensor): lower Cholesky factor [*, n, n] of the covariance before the tanh.
 
     Keyword Args:
-        low, high (float or Tensor): bounds, one number or [n]. Default: ±1.
-
-    Raises:
-        ValueError: if a lower bound is not below its upper bound.
+        low, high (float or Tensor): bounds, low below high, one number or [n]. Default: ±1.
 
     Examples:
         >>> import torch
@@ -64,11 +61,6 @@ class LatticeNormal(D.TransformedDistribution):
         high: float | Tensor = 1.0,
     ) -> None:
         low, high = (torch.as_tensor(x, dtype=loc.dtype, device=loc.device) for x in (low, high))
-        if not torch.compiler.is_compiling() and not (low < high).all():
-            raise ValueError(
-                f"The bounds are low={low.tolist()} and high={high.tolist()}; every lower bound "
-                "must be below its upper bound. Take them from the environment's action spec."
-            )
         gaussian = D.MultivariateNormal(loc, scale_tril=scale_tril, validate_args=False)
         # TorchRL's tanh stays inside ±1, so its inverse is finite.
         squash = [SafeTanhTransform(), D.AffineTransform((high + low) / 2, (high - low) / 2)]
@@ -265,8 +257,9 @@ def make_lattice_actor(
         ``out_key`` [*, n] within the bounds.
 
     Raises:
-        ValueError: if there is no hidden layer, the bounds are not an ordered pair that contains
-            ``log_std_init``, or alpha or std_reg is negative.
+        ValueError: if there is no hidden layer, the bounds of log σ are not an ordered pair that
+            contains ``log_std_init``, the action's are not finite and in order, or alpha or std_reg
+            is negative.
 
     Examples:
         >>> import torch

@@ -129,15 +129,16 @@ def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
     """Lower and upper bounds of a ``Bounded`` leaf.
 
     Raises:
-        ValueError: if the spec is not ``Bounded``, or its range is not finite.
+        ValueError: if the spec is not ``Bounded``, or a bound is not finite or not below its upper
+            bound.
     """
     if isinstance(action_spec, Bounded):
         low, high = action_spec.space.low, action_spec.space.high
-        if (high - low).isfinite().all():
+        if ((high - low).isfinite() & (low < high)).all():
             return low, high
     raise ValueError(
         f"The action spec is a {type(action_spec).__name__} of shape {tuple(action_spec.shape)} "
-        "without finite bounds; pass the bounded leaf of one environment, such as "
+        "without finite, ascending bounds; pass the bounded leaf of one environment, such as "
         "env.action_spec_unbatched."
     )
 
