@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import os
 import re
-import tokenize
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -200,17 +197,10 @@ def _load(path: Path) -> np.ndarray | dict[str, np.ndarray]:
             found = {name: loaded[name] for name in loaded.files}
             # Of a file that is no array, NumPy hands out the bytes.
             return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    except OSError:
+        raise
     # A damaged file can ask for a password, an unknown compression or all memory, and not parse.
-    except (
-        ValueError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-        SyntaxError,
-        tokenize.TokenError,
-        RuntimeError,
-        MemoryError,
-    ) as error:
+    except Exception as error:
         raise ValueError(
             f"{path} does not hold arrays of numbers ({error}); save it with numpy.save or "
             "numpy.savez, without objects."
