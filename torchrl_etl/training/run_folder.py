@@ -63,15 +63,9 @@ class RunFolder:
             self._lock = FileLock(self.path / ".lock", is_singleton=True)
             self._lock.acquire(timeout=0)
             # Checked under the lock: another run may have started and finished meanwhile.
-            if (self.path / "config.yaml").exists() and not resume:
-                self._lock.release()
-                raise _HoldsARun(
-                    f"{self.path} already holds a run; continue it with {self._resume}, or choose "
-                    "another run_dir."
-                )
-            write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
-        except _HoldsARun:
-            raise
+            taken = (self.path / "config.yaml").exists() and not resume
+            if not taken:
+                write_atomically(self.path / "config.yaml", OmegaConf.to_yaml(self._config))
         except Timeout:
             raise FileExistsError(
                 f"Another process uses {self.path}; wait for it, or stop it."
@@ -81,6 +75,12 @@ class RunFolder:
                 f"The run folder {self.path} cannot be written ({error.strerror}); choose another "
                 "run_dir or fix its permissions."
             ) from error
+        if taken:
+            self._lock.release()
+            raise FileExistsError(
+                f"{self.path} already holds a run; continue it with {self._resume}, or choose "
+                "another run_dir."
+            )
         # One entry per start: a run may be resumed on another machine or commit.
         self.write_json("versions.json", [*self.versions, {**facts(), "saved": self.saved}])
 
@@ -217,10 +217,6 @@ def _claimed(path: Path) -> Path:
             continue
         return candidate
     raise AssertionError("numbers do not end")
-
-
-class _HoldsARun(FileExistsError):
-    """Distinguishes a folder that holds a run from one that cannot be written."""
 
 
 class _ResumableTensorboard(TensorboardLogger):
