@@ -99,10 +99,9 @@ class RunFolder:
         lock.release()
         return False
 
-    def write_json(self, name: str, content: Any) -> Path:
-        """Write a JSON file atomically; returns its path."""
+    def write_json(self, name: str, content: Any) -> None:
+        """Write a JSON file atomically."""
         write_atomically(self.path / name, as_json(content))
-        return self.path / name
 
     def checkpoints(self, stage: str) -> Path:
         return self.path / "checkpoints" / stage
@@ -132,7 +131,6 @@ class RunFolder:
 
     @property
     def pictures(self) -> Path:
-        (self.path / "pictures").mkdir(exist_ok=True)
         return self.path / "pictures"
 
     @property
