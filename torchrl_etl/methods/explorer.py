@@ -85,14 +85,13 @@ class Explorer:
             transforms=self.relabel,
             keep=(*self.exploration.keep, *self.selector.keep),
         )
-        self.seed = self.stage.seed
 
     def condense(self, on_update: Callable[[], None] = lambda: None) -> Work[SynergyMap]:
         """Finish the training of the synergy model; returns the decoder for stage 2.
 
         ``on_update`` is called before every few updates and may raise to stop.
         """
-        torch.manual_seed(self.seed)  # the same whether or not the run was resumed
+        torch.manual_seed(self.stage.seed)  # the same whether or not the run was resumed
         if self.model.loss is None:
             self.model.fit(self.actions(), on_update=on_update)
         else:
