@@ -77,10 +77,8 @@ def main(config: DictConfig) -> None:
             trained.policy, trained.env, trained.task, episodes=config.episodes
         )
         result = {"env": trained.task["name"], "goal": task.goal, **evaluation.summary()}
-    print(
-        f"{trained.task['name']}{task.goal_in_words}, deterministic policy, "
-        f"{config.episodes} episodes"
-    )
+    episodes = "1 episode" if config.episodes == 1 else f"{config.episodes} episodes"
+    print(f"{trained.task['name']}{task.goal_in_words}, deterministic policy, {episodes}")
     print_intervals(result)
     if trained.card is not None:
         print(f"  {beside(trained.card, evaluation)}")
