@@ -269,13 +269,12 @@ def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
         remedy = "if you trust it, import it first in Python, as no setting of the recipes does"
         check_imported(decoder.get("kind"), f"The decoder of {folder}", ZooError, remedy)
     try:
-        return _fill(folder, make_policy(**card.policy), safetensors.torch.load(content))
+        policy, state = make_policy(**card.policy), safetensors.torch.load(content)
     except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-        if isinstance(error, ZooError):
-            raise
         raise ZooError(
             f"{CARD} in {folder} describes no policy ({error}); copy it again."
         ) from error
+    return _fill(folder, policy, state)
 
 
 def _fill(
