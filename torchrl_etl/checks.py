@@ -22,6 +22,7 @@ __all__ = [
     "check_real",
     "check_sizes",
     "check_width",
+    "choose_one",
     "naming",
     "not_finite",
     "renaming",
@@ -39,9 +40,18 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         ValueError: stage is 'lern'; choose one of explore, learn, all (nearest: learn).
     """
     if value not in choices:
-        near = difflib.get_close_matches(str(value), choices, n=1)
-        hint = f" (nearest: {near[0]})" if near else ""
-        raise ValueError(f"{name} is {value!r}; choose one of {', '.join(choices)}{hint}.")
+        raise ValueError(f"{name} is {value!r}; {choose_one(value, choices)}.")
+
+
+def choose_one(value: object, choices: Sequence[str]) -> str:
+    """The end of a message about a value that is none of ``choices``.
+
+    Examples:
+        >>> choose_one("lern", ("explore", "learn", "all"))
+        'choose one of explore, learn, all (nearest: learn)'
+    """
+    near = difflib.get_close_matches(str(value), choices, n=1)
+    return f"choose one of {', '.join(choices)}" + (f" (nearest: {near[0]})" if near else "")
 
 
 def check_integer(least: int, **values: object) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium
 
-from torchrl_etl.checks import check_choice
+from torchrl_etl.checks import check_choice, choose_one
 from torchrl_etl.envs import SimulationError
 from torchrl_etl.extras import extra
 from torchrl_etl.methods.etl import BODY
@@ -203,11 +203,11 @@ def quiet_torchrl() -> None:
 
 def _check_file(conf: Path, group: str, choice: str) -> None:
     files = group_files(conf, group)
-    try:
-        check_choice(group, choice, list(files))
-    except ValueError as error:
-        said = str(error).removesuffix(".")
-        raise ValueError(f"{said}, or add a file for it to ./conf/{group}.") from None
+    if choice not in files:
+        raise ValueError(
+            f"{group} is {choice!r}; {choose_one(choice, list(files))}, or add a file for it to "
+            f"./conf/{group}."
+        )
 
 
 def _composed(config: Path, chosen: list[str]) -> tuple[DictConfig, Mapping[str, str]]:

@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from torchrl_etl.checks import check_choice, not_finite
+from torchrl_etl.checks import choose_one, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
 from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder
 from torchrl_etl.modules import SynergyMap
@@ -67,18 +67,14 @@ def find(name: str | os.PathLike[str]) -> Path:
         ...
         torchrl_etl.zoo.card.ZooError: The zoo has no 'overactuted'; choose one of ...
     """
-    if os.fspath(name) in names():
-        return ENTRIES / name
-    folder = Path(name).expanduser()
+    if (given := os.fspath(name)) in names():
+        return ENTRIES / given
+    folder = Path(given).expanduser()
     if not folder.is_dir():
-        try:
-            check_choice("zoo", os.fspath(name), names())
-        except ValueError as error:
-            _, _, choices = str(error).partition("; ")
-            raise ZooError(
-                f"The zoo has no {os.fspath(name)!r}; {choices.removesuffix('.')}, or pass the "
-                "folder of another entry."
-            ) from None
+        raise ZooError(
+            f"The zoo has no {given!r}; {choose_one(given, names())}, or pass the folder of "
+            "another entry."
+        )
     return folder
 
 
