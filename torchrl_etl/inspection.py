@@ -139,10 +139,12 @@ def open_zoo(name: str, env: str | None = None) -> Subject:
 
 def _with_policy(subject: Subject, experiment: Experiment) -> Subject:
     """Adds the learned policy and its decoder."""
-    if _newest(experiment, "learn") is not None:
-        learner = experiment.learned().learner
-        return replace(subject, policy=learner.policy, decoder=learner.decoder)
-    return replace(subject, decoder=experiment.method.decoder())
+    folder = _newest(experiment, "learn")
+    if folder is None:
+        return replace(subject, decoder=experiment.method.decoder())
+    learner = experiment.method.stage().learner
+    Checkpoint(policy=learner.policy).load(folder)
+    return replace(subject, policy=learner.policy, decoder=learner.decoder)
 
 
 def _with_explorer(subject: Subject, experiment: Experiment) -> Subject:
