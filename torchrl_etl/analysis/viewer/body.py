@@ -22,6 +22,7 @@ with extra("viewer"):
     import trimesh
     import viser
     from mjviser.conversions import create_site_mesh, group_geoms_by_visual_compat, merge_geoms
+    from viser.transforms import SO3
 
 __all__ = ["Body"]
 
@@ -91,7 +92,7 @@ class Body:
                 shadow_opacity=0.2,
                 plane_opacity=0.3,
                 position=self._data.geom_xpos[geom],
-                wxyz=_quaternions(self._data.geom_xmat[geom][None])[0],
+                wxyz=SO3.from_matrix(self._data.geom_xmat[geom].reshape(3, 3)).wxyz,
             )
         for geom in np.flatnonzero(shown & ~flat & (opacity < 1)).tolist():
             mesh, rgba = merge_geoms(model, [geom]), _rgba(model, "geom")[geom]
@@ -131,7 +132,8 @@ class Body:
         before = self._placed[first : first + len(parts)]
         moved = np.flatnonzero(~(np.abs(now - before) < 1e-5).all(1))
         before[moved] = now[moved]
-        for part, wxyz in zip(moved, _quaternions(now[moved, 3:]), strict=True):
+        turned = SO3.from_matrix(now[moved, 3:].reshape(-1, 3, 3)).wxyz
+        for part, wxyz in zip(moved, turned, strict=True):
             handle = parts[part][0]
             handle.position, handle.wxyz = now[part, :3], wxyz
 
@@ -226,11 +228,3 @@ def _from_z(directions: np.ndarray) -> np.ndarray:
     wxyz = np.stack([1.0 + z, -y, x, np.zeros_like(x)], 1)
     wxyz[z < -0.999999] = [0.0, 1.0, 0.0, 0.0]
     return wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-
-
-def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] of flattened rotation matrices [N, 9]."""
-    wxyz = np.empty((len(matrices), 4))
-    for quaternion, matrix in zip(wxyz, matrices, strict=True):
-        mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix, np.float64).reshape(9))
-    return wxyz
