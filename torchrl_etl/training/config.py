@@ -208,9 +208,9 @@ def quoted(value: str) -> str:
         >>> parse_override(f"run_dir={quoted('runs/a, (new)')}").value()
         'runs/a, (new)'
     """
-    # Backslashes are literal except before a quotation mark.
-    value = re.sub(r"(\\*)'", r"\1\1\\'", value)
-    return "'" + re.sub(r"(\\+)$", r"\1\1", value) + "'"
+    with extra("recipes"):
+        from hydra.core.override_parser.types import Quote, QuotedString
+    return QuotedString(value, Quote.single).with_quotes()
 
 
 def resume_setting(folders: Sequence[Path]) -> str:
