@@ -13,9 +13,8 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_etl.training.buffer_adapter import BufferAdapter
+from torchrl_etl.training.buffer import BufferAdapter, make_storage
 from torchrl_etl.training.checkpoints import Checkpoints, _size
-from torchrl_etl.training.storage import make_storage
 
 
 def buffer(capacity: int) -> TensorDictReplayBuffer:

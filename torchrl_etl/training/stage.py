@@ -23,9 +23,8 @@ from torchrl_etl.checks import check_choice, check_integer, check_real
 from torchrl_etl.collectors import Batches, CollectionError, make_batches
 from torchrl_etl.collectors.remote import training_seed
 from torchrl_etl.learners import SACLearner
-from torchrl_etl.training.buffer_adapter import BufferAdapter
+from torchrl_etl.training.buffer import BufferAdapter, make_storage
 from torchrl_etl.training.continued_multi_step import ContinuedMultiStep
-from torchrl_etl.training.storage import make_storage
 from torchrl_etl.training.work import PendingUpdates, Work
 
 __all__ = ["Progress", "Stage"]
