@@ -269,7 +269,6 @@ class SeededVectorEnv(SyncVectorEnv):
             self._env_obs[i] = parts
             for name, part in parts.items():
                 self._observations[name][i] = part
-        self._autoreset_envs = self._terminations | self._truncations
         observations = {name: part.copy() for name, part in self._observations.items()}
         ends = self._terminations.copy(), self._truncations.copy()
         return observations, self._rewards.copy(), *ends, {}
