@@ -23,6 +23,7 @@ __all__ = ["DynSynNetwork", "GroupedTanhNormal", "MuscleGroups", "make_dynsyn_ac
 
 # Weights of members stay within 10 % of 1, even before the amplitude limits them.
 _DEVIATION = 0.1
+_WEIGHT_SCALE = math.exp(0.5)  # standard deviation before the tanh
 
 
 class MuscleGroups(NamedTuple):
@@ -72,7 +73,7 @@ class GroupedTanhNormal(D.Distribution):
 
     Where bounds are [-1, 1], a muscle's action is its group's action y times a weight, clamped to
     the bounds. The weight is 1 for a group's first member. For the others it is
-    w = 1 + clip(0.1 tanh(v), ±amplitude), v ~ N(weight_loc, weight_scale²).
+    w = 1 + clip(0.1 tanh(v), ±amplitude), v ~ N(weight_loc, e).
 
     The log-probability covers y alone, read from the first members: a density over k dimensions.
 
@@ -85,7 +86,6 @@ class GroupedTanhNormal(D.Distribution):
 
     Keyword Args:
         low, high (float or Tensor): bounds, one number or [n]. Default: ±1.
-        weight_scale (float): standard deviation of v. Default: e^0.5.
 
     Examples:
         >>> import torch
@@ -113,7 +113,6 @@ class GroupedTanhNormal(D.Distribution):
         *,
         low: float | Tensor = -1.0,
         high: float | Tensor = 1.0,
-        weight_scale: float = math.exp(0.5),
     ) -> None:
         self.group, self.first, self.slot = group, first, slot
         self.low, self.high = (
@@ -122,7 +121,7 @@ class GroupedTanhNormal(D.Distribution):
         )
         self.center, self.half = (self.high + self.low) / 2, (self.high - self.low) / 2
         self.group_normal = TanhNormal(loc, scale)  # where bounds are ±1
-        self.weight_loc, self.weight_scale, self.amplitude = weight_loc, weight_scale, amplitude
+        self.weight_loc, self.amplitude = weight_loc, amplitude
         super().__init__(loc.shape[:-1], self.low.shape, validate_args=False)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
@@ -132,7 +131,7 @@ class GroupedTanhNormal(D.Distribution):
         """Samples [S, *, n] with their log-probabilities [S, *], exact at the bounds too."""
         shared, log_prob = rsample_and_log_prob(self.group_normal, sample_shape)
         noise = standard_normal(self.weight_loc.expand(*sample_shape, *self.weight_loc.shape))
-        action = self._spread(shared, self.weight_loc + self.weight_scale * noise)
+        action = self._spread(shared, self.weight_loc + _WEIGHT_SCALE * noise)
         return action, log_prob - self._log_half
 
     def log_prob(self, value: Tensor) -> Tensor:

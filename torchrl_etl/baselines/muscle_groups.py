@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["group_muscles", "record_muscle_lengths"]
 
+_STARTS = 20
+
 
 def record_muscle_lengths(
     env: EnvBase,
@@ -93,17 +95,15 @@ def record_muscle_lengths(
     return torch.from_numpy(lengths)
 
 
-def group_muscles(
-    lengths: Tensor, num_groups: int, *, chunk: int = 100, restarts: int = 20, seed: int = 0
-) -> Tensor:
+def group_muscles(lengths: Tensor, num_groups: int, *, chunk: int = 100, seed: int = 0) -> Tensor:
     """Group muscles whose lengths vary alike.
 
     Each muscle's length is scaled to [0, 1] over the recording, which is split into chunks. The
     distance of two muscles is one minus the cosine of their uncentered lengths, averaged over
-    chunks, at least zero. k-medoids on these distances gives the groups.
+    chunks, at least zero. k-medoids on these distances gives the groups, from 20 random starts.
 
-    Deviates: the restart with the lowest loss is used; the original uses the loss that most
-    restarts reach. Frames after the last full chunk are left out.
+    Deviates: the start with the lowest loss is used; the original uses the loss that most
+    starts reach. Frames after the last full chunk are left out.
 
     Args:
         lengths (Tensor): [frames, n], from :func:`record_muscle_lengths`.
@@ -111,8 +111,7 @@ def group_muscles(
 
     Keyword Args:
         chunk (int): frames in a chunk. Default: 100.
-        restarts (int): runs of k-medoids, each from random medoids. Default: 20.
-        seed (int): seed of the first restart, increased by one for each further one. Default: 0.
+        seed (int): seed of the first start, increased by one for each further one. Default: 0.
 
     Returns:
         Tensor: group number of each muscle [n], int64; groups are numbered from 0 in the order of
@@ -129,7 +128,7 @@ def group_muscles(
         >>> group_muscles(torch.stack([slow, fast, 2 * slow, 5 + fast], -1), 2)
         tensor([0, 1, 0, 1])
     """
-    check_integer(1, num_groups=num_groups, chunk=chunk, restarts=restarts)
+    check_integer(1, num_groups=num_groups, chunk=chunk)
     if lengths.ndim != 2 or len(lengths) < chunk or num_groups > lengths.shape[1]:
         raise ValueError(
             f"lengths has shape {tuple(lengths.shape)}; {num_groups} groups from chunks of {chunk} "
@@ -151,7 +150,7 @@ def group_muscles(
         import kmedoids
     runs = (
         kmedoids.fasterpam(distance, num_groups, init="random", random_state=seed + i, n_cpu=1)
-        for i in range(restarts)
+        for i in range(_STARTS)
     )
     return _numbered(min(runs, key=lambda run: run.loss).labels)
 

@@ -273,9 +273,9 @@ def _by_its_spec(name: str, goal: Goal | None) -> Task:
     return replace(task, suite="myosuite", solved_steps=1 if once else _MYOSUITE_STEPS)
 
 
-def _nearest(name: str, count: int = 5) -> list[str]:
+def _nearest(name: str) -> list[str]:
     suite_names = ("-".join(pair) for pair in dm_control_suite().ALL_TASKS)
     known = [*_BY_NAME, *gym.registry, *suite_names]
     lowered = {candidate.lower(): candidate for candidate in reversed(known)}
-    found = difflib.get_close_matches(name.lower(), lowered, n=count, cutoff=0.5)
+    found = difflib.get_close_matches(name.lower(), lowered, n=5, cutoff=0.5)
     return [lowered[candidate] for candidate in found]
