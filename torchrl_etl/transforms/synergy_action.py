@@ -29,7 +29,7 @@ class SynergyAction(LatentAction):
     Keyword Args:
         synergy_key (NestedKey): key that the policy writes. Use ``"action"`` for policies that can
             write no other; the recorded ``"action"`` is then the synergy. Default: ``"synergy"``.
-        executed_key, action_key, decoded_key (NestedKey, optional): see
+        **keys: ``executed_key``, ``action_key`` and ``decoded_key`` of
             :class:`~torchrl_etl.transforms.LatentAction`.
 
     Keys:
@@ -62,9 +62,7 @@ class SynergyAction(LatentAction):
         decoder: TensorDictModuleBase,
         *,
         synergy_key: NestedKey = "synergy",
-        executed_key: NestedKey = "executed_action",
-        action_key: NestedKey | None = None,
-        decoded_key: NestedKey | None = None,
+        **keys: NestedKey | None,
     ) -> None:
         needed = ("in_keys", "out_keys", "synergy_spec", "action_dim", "low", "high")
         missing = [name for name in needed if not hasattr(decoder, name)]
@@ -73,14 +71,7 @@ class SynergyAction(LatentAction):
                 f"The decoder is a {type(decoder).__name__} without {', '.join(missing)}; pass a "
                 "torchrl_etl.modules.SynergyDecoder or a TensorDictModule that has them."
             )
-        super().__init__(
-            decoder,
-            decoder.synergy_spec,
-            latent_key=synergy_key,
-            executed_key=executed_key,
-            action_key=action_key,
-            decoded_key=decoded_key,
-        )
+        super().__init__(decoder, decoder.synergy_spec, latent_key=synergy_key, **keys)
 
     @property
     def synergy_key(self) -> NestedKey:
