@@ -285,9 +285,9 @@ def test_every_make_actor_takes_several_and_nested_keys(
     assert spec.expand(5, 4).is_in(action)
 
 
-def test_quiet_entries_have_a_fixed_standard_deviation() -> None:
+def test_last_entries_have_a_fixed_standard_deviation() -> None:
     spec = Bounded(-1, 1, shape=(5,))
-    actor = make_actor({"observation": 3}, spec, hidden=(8,), quiet=3, quiet_std=0.02)
+    actor = make_actor({"observation": 3}, spec, hidden=(8,), fixed_std_dims=3, fixed_std=0.02)
     distribution = actor.get_dist(TensorDict({"observation": torch.randn(7, 3)}, [7]))
     assert (distribution.scale[:, 2:] == 0.02).all() and (distribution.scale[:, :2] > 0.5).all()
     distribution.scale.sum().backward()

@@ -243,10 +243,10 @@ def test_decoder_is_trained_unless_frozen(fine_tuning, learns):
 
 def test_entropy_excludes_a_residual_with_fixed_noise():
     log = math.log(2 * math.pi * math.e) / 2  # of a standard Gaussian
-    quiet = "learn.decoder.residual_std=0.05"
+    fixed = "learn.decoder.residual_std=0.05"
     for std, wanted in (("0.4", 2 * (log + math.log(0.4))), ("null", -2.0)):
         decoder = SynergyDecoder(2, 16, hidden=(32, 32), residual=1.0)
-        stage = learn_stage(decoder, quiet, f"learn.sac.action_std={std}")
+        stage = learn_stage(decoder, fixed, f"learn.sac.action_std={std}")
         sac = stage.learner.objective.sac
         assert sac.target_entropy.item() == pytest.approx(wanted, rel=1e-5)
     assert sac.entropy_dims == 2

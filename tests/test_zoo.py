@@ -44,6 +44,13 @@ def exported(run):
     return run.parent / "toy"
 
 
+def test_card_with_former_argument_names_gives_the_same_policy():
+    actor = {"kind": "gaussian", "quiet": 1, "quiet_std": 0.02}
+    policy = zoo.make_policy(observation_dim=3, low=[-1.0] * 2, high=[1.0] * 2, actor=actor)
+    scale = policy(TensorDict({"observation": torch.zeros(4, 3)}, [4]))["scale"]
+    assert (scale[:, 1] == 0.02).all() and (scale[:, 0] > 0.5).all()
+
+
 @pytest.mark.parametrize("kind", ["synergies=pca", "exploration=metra"])
 def test_saved_config_of_another_kind_is_read_unchanged(kind, tmp_path):
     made = Experiment(tiny(f"run_dir='{tmp_path}/run'", kind))

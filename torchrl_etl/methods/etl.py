@@ -277,9 +277,10 @@ class ETL(Method):
         with naming("learn.decoder"), renaming(weight="distillation_weight"):
             term = Term(DecoderLoss(decoder), weight=weight, lr=options["lr"])
         # The policy does not control the entropy of a residual with fixed noise.
-        entropy_dims = decoder.synergy_dim - self._quiet["quiet"] if self._quiet else None
+        fixed = self._fixed_std
+        entropy_dims = decoder.synergy_dim - fixed["fixed_std_dims"] if fixed else None
         self.context.seed_everything("learn")
-        actor = self.context.actor(decoder=decoder, **self._quiet)
+        actor = self.context.actor(decoder=decoder, **fixed)
         loss = self.context.loss(
             actor,
             decoder=decoder,
@@ -292,13 +293,15 @@ class ETL(Method):
         return self.context.stage(learner, keep=("synergy",), prefill_size=room)
 
     def actor(self) -> dict[str, Any]:
-        return {**super().actor(), **self._quiet}
+        return {**super().actor(), **self._fixed_std}
 
     @property
-    def _quiet(self) -> dict[str, Any]:
+    def _fixed_std(self) -> dict[str, Any]:
         """Arguments of the actor if the residual has a fixed standard deviation."""
         std = self.context.config.learn.decoder.residual_std
-        return {} if std is None else {"quiet": self.context.spec.action_dim, "quiet_std": std}
+        if std is None:
+            return {}
+        return {"fixed_std_dims": self.context.spec.action_dim, "fixed_std": std}
 
     def begin(self, stage: Stage) -> None:
         if self.prefills:

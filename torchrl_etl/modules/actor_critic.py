@@ -62,8 +62,8 @@ class _FixedStdTail(nn.Module):
     """Fixes the standard deviation of a Gaussian's last ``count`` entries."""
 
     def __init__(self, count: int, std: float) -> None:
-        check_integer(1, quiet=count)
-        check_real("(0, inf)", quiet_std=std)
+        check_integer(1, fixed_std_dims=count)
+        check_real("(0, inf)", fixed_std=std)
         super().__init__()
         self.count, self.std = count, std
 
@@ -111,8 +111,8 @@ def make_actor(
     body: Body = "mlp",
     hidden: Sequence[int] = (256, 256),
     layer_norm: bool = True,
-    quiet: int = 0,
-    quiet_std: float = 0.05,
+    fixed_std_dims: int = 0,
+    fixed_std: float = 0.05,
 ) -> ProbabilisticActor:
     """Tanh-Gaussian actor scaled to the bounds of ``action_spec``.
 
@@ -128,8 +128,8 @@ def make_actor(
             processors with bfloat16 instructions, and longer on others.
         hidden (sequence of int): widths of the hidden layers, or of the residual blocks.
         layer_norm (bool): normalize each hidden layer, or the inputs of residual blocks and head.
-        quiet (int): number of last entries whose standard deviation before the tanh is fixed at
-            ``quiet_std``, not learned. Default: 0.
+        fixed_std_dims (int): number of last entries whose standard deviation before the tanh is
+            ``fixed_std``, not learned. Default: 0.
 
     Keys:
         reads ``inputs``; writes ``loc``, ``scale`` [*, n] (before the tanh) and ``out_key`` [*, n].
@@ -147,8 +147,8 @@ def make_actor(
     layers = make_layers(sum(inputs.values()), 2 * action_spec.shape[-1], body, hidden, layer_norm)
     start_small(layers)
     layers.append(NormalParamExtractor(scale_mapping="biased_softplus_1.0", scale_lb=1e-3))
-    if quiet:
-        layers.append(_FixedStdTail(quiet, quiet_std))
+    if fixed_std_dims:
+        layers.append(_FixedStdTail(fixed_std_dims, fixed_std))
     return actor_with(TanhNormal, layers, inputs, ["loc", "scale"], action_spec, out_key)
 
 

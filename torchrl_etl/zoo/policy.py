@@ -28,6 +28,8 @@ ACTORS: dict[str, Callable[..., ProbabilisticTensorDictSequential]] = {
 }
 """Factory functions of actors by kind."""
 
+_RENAMED = {"quiet": "fixed_std_dims", "quiet_std": "fixed_std"}  # in older cards
+
 
 def make_policy(
     *,
@@ -59,7 +61,7 @@ def make_policy(
         >>> policy.in_keys, policy.out_keys
         (['observation'], ['loc', 'scale', 'action'])
     """
-    options = dict(actor)
+    options = {_RENAMED.get(name, name): value for name, value in actor.items()}
     check_choice("kind", kind := options.pop("kind", None), list(ACTORS))
     # These initial weights will be overwritten, so keep the global generator unchanged.
     with torch.random.fork_rng(devices=[]):
