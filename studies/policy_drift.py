@@ -77,7 +77,7 @@ def measured(stage: Stage, space: ContinuousBox) -> dict[str, float]:
     made = 0
     for updates in UPDATES:
         for _ in range(updates - made):
-            stage.update()
+            stage.updated.update(stage.samples(1)[0])
         made = updates
         found[f"drift_{updates}"] = size(muscles() - meant)
     return {key: round(value, 4) for key, value in found.items()}

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from tensordict import TensorDictBase
 from torch import nn
 
 from tests.configs import tiny
@@ -44,9 +45,19 @@ def fill(stage, batches: int = 6) -> None:
         stage.collect()
 
 
+def sample(stage: Stage) -> TensorDictBase:
+    """A batch [B] from the buffer."""
+    return stage.samples(1)[0]
+
+
+def update(stage: Stage) -> TensorDictBase:
+    """One update on a sampled batch; returns scalars to log."""
+    return stage.updated.update(sample(stage))
+
+
 def prepared(stage):
     """A sampled batch, prepared as the losses of the objective read it."""
-    return stage.learner.objective.prepare(stage.sample())
+    return stage.learner.objective.prepare(sample(stage))
 
 
 def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
@@ -69,6 +80,6 @@ def goes_on_after_a_load(make: Callable[[], Stage], folder: Path) -> bool:
         one.checkpoint().load(folder / "saved")
         one.restart_collection()
         rows.append([one.collect().select("action", "observation") for _ in range(3)])
-        rows[-1].append(one.update())
+        rows[-1].append(update(one))
         one.close()
     return all((ours == theirs).all() for ours, theirs in zip(*rows, strict=True))

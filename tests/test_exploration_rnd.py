@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.stages import changed, explorer, fill, goes_on_after_a_load, prepared, snapshot
+from tests.stages import (
+    changed,
+    explorer,
+    fill,
+    goes_on_after_a_load,
+    prepared,
+    sample,
+    snapshot,
+    update,
+)
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.exploration import RNDExploration
 from torchrl_etl.learners import StackedLearners
@@ -34,7 +43,7 @@ def test_one_update_moves_policy_predictor_and_gmvae_but_not_the_random_network(
     moving = (stage.learner.behavior, loss.predictor_network, found.model.model)
     before = [snapshot(part) for part in moving]
     fixed = snapshot(loss.target_network)
-    stage.update()
+    update(stage)
     assert all(changed(part, was) for part, was in zip(moving, before, strict=True))
     assert not changed(loss.target_network, fixed)
 
@@ -74,7 +83,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
     batches = []
     for found in twins[0]:
         torch.manual_seed(0)
-        batches.append(found.stage.sample())
+        batches.append(sample(found.stage))
     group = StackedLearners([found.stage.learner for found in twins[0]])
     inputs = []
     for learner, batch in zip(group.learners, batches, strict=True):
@@ -83,7 +92,7 @@ def test_seeds_side_by_side_learn_what_each_learns_alone():
     together = [scalars[0] for scalars in group.updates(inputs)]
     for found, batch, scalars in zip(twins[1], batches, together, strict=True):
         torch.manual_seed(0)
-        assert (found.stage.sample() == batch).all()
+        assert (sample(found.stage) == batch).all()
         torch.manual_seed(1)
         alone = found.stage.learner.update(batch)
         for key in ("loss_predictor", "loss_actor", "loss_qvalue"):

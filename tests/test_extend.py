@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger
 
 from tests.commands import command
 from tests.configs import CONF, ROOT, composed, tiny
-from tests.stages import changed, fill, goes_on_after_a_load, prepared, snapshot
+from tests.stages import changed, fill, goes_on_after_a_load, prepared, sample, snapshot, update
 from torchrl_etl.command_line import check_overrides, translate
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.exploration import Exploration
@@ -185,7 +185,7 @@ def test_curiosity_rewards_the_prediction_error_and_trains_its_model(page_files)
     error = (loss.model(inputs) - batch["next", "observation"]).square().sum(-1, keepdim=True)
     torch.testing.assert_close(batch["next", "surprise"], error)
     before = snapshot(loss), snapshot(found.stage.learner.behavior)
-    found.stage.update()
+    update(found.stage)
     assert changed(loss, before[0]) and changed(found.stage.learner.behavior, before[1])
     found.stage.close()
 
@@ -231,7 +231,7 @@ def test_thrift_method_learns_on_reward_minus_effort(page_files):
     stage = Experiment(tiny("run_dir=unused", *asked)).method.stage()
     stage.restart_collection()
     fill(stage)
-    batch = stage.sample()
+    batch = sample(stage)
     stage.close()
     effort = ((batch["action"] + 1) / 2).square().mean(-1, keepdim=True)
     cost = batch["next", "reward"] - batch["next", "thrifty_reward"]

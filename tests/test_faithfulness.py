@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from tests.configs import CONF, ROOT
-from tests.stages import explorer, fill, prepared
+from tests.stages import explorer, fill, prepared, update
 from torchrl_etl.methods.explorer import Explorer
 from torchrl_etl.training import run_alone
 
@@ -102,7 +102,7 @@ def test_every_setting_on_the_page_is_accepted_as_written(setting):
 
 def test_paper_preset_configures_bonus_regularizer_and_relabeling():
     paper = explored("faithful=paper")
-    paper.stage.update()
+    update(paper.stage)
     (relabel,), (bonus,) = paper.relabel, paper.stage.learner.objective.transforms
     assert bonus.deviation is None
     assert paper.stage.learner.objective.terms[0].loss.regularizer == "literal"

@@ -12,7 +12,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
-from tests.stages import fill, learn_stage
+from tests.stages import fill, learn_stage, sample
 from torchrl_etl.learners import SACLearner, Term, WarmedUpEMA
 from torchrl_etl.learners.adam import GradientAdam
 from torchrl_etl.modules import StateEncoder, SynergyDecoder, make_actor, make_critic
@@ -107,9 +107,9 @@ def test_batches_may_have_any_size():
     fill(stage)
     stage.close()
     for size in (1, 16, 8):
-        draws = stage.learner.inputs(stage.sample()[:size].unsqueeze(0))["draws"]
+        draws = stage.learner.inputs(sample(stage)[:size].unsqueeze(0))["draws"]
         assert all(each.shape[:2] == (1, size) for each in draws.values())
-        stage.learner.update(stage.sample()[:size])
+        stage.learner.update(sample(stage)[:size])
 
 
 def test_updates_on_several_batches_equal_updates_in_turn():

@@ -9,7 +9,7 @@ from torchrl.data import Bounded
 from torchrl.envs.transforms import Transform
 
 from tests.configs import RESIDUAL
-from tests.stages import explorer, fill, learn_stage, method_stage, snapshot
+from tests.stages import explorer, fill, learn_stage, method_stage, sample, snapshot
 from torchrl_etl.baselines import make_dynsyn_actor
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.learners import SACLearner, StackedLearners
@@ -81,7 +81,7 @@ def test_stacked_gradients_equal_those_of_each_learner(make):
     for stage in stages:
         fill(stage)
         stage.close()
-    batches = [stage.sample() for stage in stages]
+    batches = [sample(stage) for stage in stages]
     assert_gradients_are_those_of_each([stage.updated for stage in stages], batches)
 
 
@@ -136,7 +136,7 @@ def test_traced_gradients_of_stacked_learners_equal_eager_ones(name, traced_only
     for stage in stages:
         fill(stage)
         stage.close()
-    batches = [stage.sample() for stage in stages]
+    batches = [sample(stage) for stage in stages]
     learners = [stage.updated for stage in stages]
     read = torch.cat(inputs(learners, batches))
     with torch.no_grad():  # so that learners differ in more than networks
@@ -172,7 +172,7 @@ def test_compiled_update_reads_weights_loaded_after_tracing(name, traced_only):
 def test_first_call_of_inputs_consumes_no_extra_random_numbers():
     stage = learn_stage()
     fill(stage)
-    batch, learner = stage.sample(), stage.learner
+    batch, learner = sample(stage), stage.learner
     torch.manual_seed(0)
     first = learner.inputs(batch.unsqueeze(0))
     torch.manual_seed(0)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from tests.configs import tiny
+from tests.stages import update
 from torchrl_etl.envs import make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.modules import SARDecoder, make_actor, make_critic
@@ -311,7 +312,7 @@ def test_stage_2_trains_the_actor_and_keeps_the_sar_decoder(blend: float) -> Non
         actor = {key: value.clone() for key, value in stage.learner.actor.state_dict().items()}
         fixed = {key: value.clone() for key, value in decoder.state_dict().items()}
         torch.testing.assert_close(batch["action"], decode(decoder, batch["synergy"]))
-        assert stage.update()["loss_decoder"] < 1e-10
+        assert update(stage)["loss_decoder"] < 1e-10
         assert any(
             not torch.equal(v, actor[k]) for k, v in stage.learner.actor.state_dict().items()
         )

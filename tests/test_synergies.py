@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tests.configs import tiny
-from tests.stages import explorer
+from tests.stages import explorer, update
 from torchrl_etl.analysis import describe_synergies, draw_synergies, variance_accounted_for
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.methods.explorer import Explorer
@@ -285,7 +285,7 @@ def test_affine_synergies_add_no_loss_to_stage_1(kind: str) -> None:
     assert found.model.loss is None and not len(found.fitter.objective.terms)
     for _ in range(6):
         found.stage.collect()
-    found.stage.update()
+    update(found.stage)
     decoder = run_alone(found.condense())
     assert torch.equal(run_alone(found.condense())(torch.ones(2)), decoder(torch.ones(2)))
     found.stage.close()

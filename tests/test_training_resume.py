@@ -20,6 +20,7 @@ import torch
 from tests.commands import wait_until
 from tests.configs import ROOT, TINY, tiny
 from tests.runs import has_saved, killed_when_saved, numbers, stopped
+from tests.stages import update
 from torchrl_etl.collectors import STOP_SIGNALS
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.learners import SACLearner
@@ -275,13 +276,13 @@ def test_learner_state_is_bit_exact_after_a_load(name, compile, tmp_path):
     stage.restart_collection()
     for _ in range(4):
         stage.collect()
-        stage.update()
+        update(stage)
     stage.checkpoint().save(tmp_path / "saved")
     twin = fresh()
     twin.checkpoint().load(tmp_path / "saved")
     rows = []
     for one in (stage, twin):  # the first is compiled already, the second is not
         torch.manual_seed(0)
-        rows.append(torch.stack([one.update() for _ in range(3)]))
+        rows.append(torch.stack([update(one) for _ in range(3)]))
     assert (rows[0] == rows[1]).all()
     stage.close()

@@ -10,7 +10,16 @@ from tensordict import TensorDict
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from tests.stages import changed, explorer, fill, learn_stage, method_stage, snapshot
+from tests.stages import (
+    changed,
+    explorer,
+    fill,
+    learn_stage,
+    method_stage,
+    sample,
+    snapshot,
+    update,
+)
 from torchrl_etl.training import run_alone
 
 
@@ -22,10 +31,10 @@ def test_sac_scales_rewards_by_running_returns():
         lambda _, args: seen.update(reward=args[0]["next", "reward"])
     )
     torch.manual_seed(0)
-    kept = stage.sample()["next", "reward"]
+    kept = sample(stage)["next", "reward"]
     torch.manual_seed(0)
     before = snapshot(stage.learner.behavior)
-    stage.update()
+    update(stage)
     scale = stage.learner.objective.return_scale.scale.float()
     assert scale != 1 and torch.allclose(seen["reward"], kept / scale)
     assert changed(stage.learner.behavior, before)
@@ -44,7 +53,7 @@ def test_update_moves_the_temperature_and_every_target_network(make):
     stage = make()
     fill(stage)
     stage.close()
-    learner, batch = stage.learner, stage.sample()
+    learner, batch = stage.learner, sample(stage)
     log_alpha = learner.objective.sac.log_alpha
     at = next(i for i, each in enumerate(learner.parameters) if each is log_alpha)
     inputs = learner.inputs(batch.unsqueeze(0))
@@ -92,7 +101,7 @@ def test_actor_and_critics_read_normalized_observations(method, tmp_path):
         lambda _, args: seen.update(args[0].flatten_keys("."))
     )
     statistics = snapshot(stage.learner.objective.normalizer)
-    stage.update()
+    update(stage)
     assert not changed(stage.learner.objective.normalizer, statistics), (
         "sampling a batch is not seeing new observations"
     )
@@ -138,7 +147,7 @@ def test_num_critics_sets_the_number_of_critics(number):
     fill(stage)
     weights = stage.learner.objective.sac.qvalue_network_params.flatten_keys().values()
     assert {len(weight) for weight in weights} == {number}
-    assert stage.update()["loss_qvalue"].isfinite()
+    assert update(stage)["loss_qvalue"].isfinite()
     stage.close()
 
 
@@ -148,7 +157,7 @@ def test_ema_of_the_actor_is_evaluated_and_the_actor_collects():
     averaged = list(stage.learner.ema.module.parameters())
     expected = None
     for kept in (0, 2 / 11, 3 / 12, 0.25, 0.25):  # (1 + n) / (10 + n), then ema_decay
-        stage.update()
+        update(stage)
         actor = [weight.detach().clone() for weight in stage.learner.actor.parameters()]
         expected = expected or actor
         expected = [torch.lerp(new, old, kept) for old, new in zip(expected, actor, strict=True)]
@@ -166,8 +175,8 @@ def test_ema_of_the_actor_is_evaluated_and_the_actor_collects():
 def test_ema_with_decay_zero_equals_the_actor():
     stage = learn_stage(None, "learn.sac.ema_decay=0")
     fill(stage)
-    stage.update()
-    stage.update()
+    update(stage)
+    update(stage)
     for averaged, weight in zip(
         stage.learner.ema.module.parameters(), stage.learner.actor.parameters(), strict=True
     ):
@@ -232,11 +241,11 @@ def test_buffer_stores_step_counts_only_for_n_step_returns():
     fill(stage)
     rows = stage.buffer.storage[:].clone()
     assert set(rows["steps_to_next_obs"].flatten().tolist()) == {1, 2, 3}
-    assert stage.update()["loss_qvalue"].isfinite()
+    assert update(stage)["loss_qvalue"].isfinite()
     # Transitions of stage 1 span single steps.
     stage.prefill(rows.select("observation", "synergy", "action", "next"))
     assert set(stage.newest(len(rows))["steps_to_next_obs"].flatten().tolist()) == {1}
-    assert stage.update()["loss_qvalue"].isfinite()
+    assert update(stage)["loss_qvalue"].isfinite()
     stage.close()
 
 

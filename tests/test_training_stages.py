@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.configs import RESIDUAL, tiny
-from tests.stages import changed, explorer, fill, learn_stage, prepared, snapshot
+from tests.stages import changed, explorer, fill, learn_stage, prepared, sample, snapshot, update
 from torchrl_etl.collectors import Batches, CollectionError
 from torchrl_etl.draws import given_draws
 from torchrl_etl.envs import AnalyticOveractuated
@@ -102,7 +102,7 @@ def test_one_update_of_stage_1_moves_policy_encoder_and_gmvae():
         snapshot(part)
         for part in (stage.learner.behavior, found.exploration.encoder, found.model.model)
     ]
-    stage.update()
+    update(stage)
     assert changed(stage.learner.behavior, before[0])
     assert changed(found.exploration.encoder, before[1])
     assert changed(found.model.model, before[2])
@@ -197,14 +197,14 @@ def test_relabel_draws_directions_that_were_not_followed():
     stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
-    drawn = {tuple(row) for row in stage.sample()["direction"].tolist()}
+    drawn = {tuple(row) for row in sample(stage)["direction"].tolist()}
     assert not followed & drawn
     stage.close()
     found = explorer("exploration.relabel=0")
     stage = found.stage
     fill(stage)
     followed = {tuple(row) for row in stage.buffer.storage[:]["direction"].tolist()}
-    assert {tuple(row) for row in stage.sample()["direction"].tolist()} <= followed
+    assert {tuple(row) for row in sample(stage)["direction"].tolist()} <= followed
     stage.close()
 
 
@@ -235,7 +235,7 @@ def test_decoder_is_trained_unless_frozen(fine_tuning, learns):
         with torch.no_grad():
             stage.learner.decoder.module.decoder.mlp[-1].bias.add_(0.1)
     before, policy = snapshot(stage.learner.decoder), snapshot(stage.learner.behavior)
-    stage.update()
+    update(stage)
     assert changed(stage.learner.decoder, before) is learns
     assert changed(stage.learner.behavior, policy)
     stage.close()
@@ -258,7 +258,7 @@ def test_eq_10_is_self_distillation_on_fresh_pairs():
     stage = learn_stage(None, "learn.decoder.fine_tuning=reconstruction", "learn.decoder.lr=1e-2")
     fill(stage)
     before = snapshot(stage.learner.decoder)
-    assert stage.update()["loss_decoder"] < 1e-10
+    assert update(stage)["loss_decoder"] < 1e-10
     after = stage.learner.decoder.state_dict()
     assert all(torch.allclose(after[key], before[key], atol=1e-4) for key in before)
     stage.close()
@@ -269,14 +269,14 @@ def test_gmvae_and_state_encoder_are_bit_identical_through_stage_2():
     first = found.stage
     fill(first)
     for _ in range(3):
-        first.update()
+        update(first)
     decoder = run_alone(found.condense())
     before = copy.deepcopy([snapshot(found.exploration.encoder), snapshot(found.model.model)])
     second = learn_stage(decoder, "learn.decoder.lr=1e-2")
     fill(second)
     tuned = snapshot(second.learner.decoder)
     for _ in range(5):
-        second.update()
+        update(second)
     assert not changed(found.exploration.encoder, before[0])
     assert not changed(found.model.model, before[1])
     assert changed(second.learner.decoder, tuned)
@@ -321,7 +321,7 @@ def test_gaussian_divergence_trains_its_latent_dynamics():
     found = explorer("exploration.metric.divergence=gaussian")
     stage = found.stage
     fill(stage)
-    assert "loss_dynamics" in stage.update().keys()
+    assert "loss_dynamics" in update(stage).keys()
     stage.close()
 
 
@@ -356,7 +356,7 @@ def test_compiled_update_equals_the_eager_update():
     settings = (*RESIDUAL, "actor.hidden=[16,16]", "critic.hidden=[16,16]")
     stages = [learn_stage(None, f"compile={compile}", *settings) for compile in ("false", "true")]
     fill(stages[0])
-    batch = stages[0].sample()
+    batch = sample(stages[0])
     stages[1].learner.objective.load_state_dict(stages[0].learner.objective.state_dict())
     outs = []
     for stage in stages:
@@ -381,6 +381,6 @@ def test_updates_learn_from_a_cuda_graph(make):
     fill(stage)
     before = snapshot(stage.learner.behavior)
     for _ in range(20):  # warm-up, capture, replay
-        assert all(value.isfinite() for value in stage.update().values())
+        assert all(value.isfinite() for value in update(stage).values())
     assert changed(stage.learner.behavior, before)
     stage.close()

@@ -195,21 +195,15 @@ class Stage:
 
     def updates(self, count: int, learner: SACLearner, name: str) -> Iterator[PendingUpdates]:
         """Yield ``count`` updates on sampled batches, a few at a time, for the stage ``name``."""
-        for few in split(count, AT_ONCE[self.device.type]):
-            yield PendingUpdates(name, learner, learner.inputs(self.samples(few)))
+        most = AT_ONCE[self.device.type]
+        for done in range(0, count, most):
+            few = self.samples(min(most, count - done))
+            yield PendingUpdates(name, learner, learner.inputs(few))
 
     def samples(self, count: int) -> TensorDictBase:
         """Sample batches [count, B] from the buffer."""
         rows = self.buffer.sample(count * self.batch_size).to(self.device)
         return rows.reshape(count, self.batch_size)
-
-    def sample(self) -> TensorDictBase:
-        """Sample a batch [B] from the buffer."""
-        return self.samples(1)[0]
-
-    def update(self) -> TensorDictBase:
-        """One update on a sampled batch; returns scalars to log."""
-        return self.updated.update(self.sample())
 
     def add_due_updates(self, transitions: int) -> None:
         """Add the updates due for this many transitions."""
@@ -311,16 +305,6 @@ def check_budget(frames: int, replay_ratio: float) -> None:
     """
     check_integer(1, frames=frames)
     check_real("(0, 1000]", replay_ratio=replay_ratio)
-
-
-def split(total: int, most: int) -> list[int]:
-    """Split ``total`` into parts of at most ``most``.
-
-    Examples:
-        >>> split(40, 16)
-        [16, 16, 8]
-    """
-    return [min(most, total - done) for done in range(0, total, most)]
 
 
 def frames_per_action(collector: Mapping[str, Any], action_repeat: int) -> int:
