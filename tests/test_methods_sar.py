@@ -131,3 +131,12 @@ def test_sar_plans_with_the_configured_length_of_an_episode(steps, needed, tmp_p
     assert sar(needed).rollout_frames == needed
     with pytest.raises(ValueError, match=f"need {needed} for two whole episodes of {steps} steps"):
         sar(needed - 1)
+
+
+def test_sar_plays_with_the_configured_arguments_of_the_environment(tmp_path):
+    other_task = "method.options.play_task=myoElbowPose1D6MRandom-v0"
+    few = rival("sar", tmp_path / "run", other_task, "+env_kwargs.obs_keys=[qpos]")
+    play = Experiment(few).method.play_stage()
+    play.restart_collection()
+    play.collect()  # with networks of the size of these observations
+    play.close()

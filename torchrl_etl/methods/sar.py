@@ -68,7 +68,9 @@ class SAR(Method):
         played, self.play_spec = context.task, context.spec
         if self.task is not None:
             played |= {"name": self.task, "goal": None, "success_key": None}
-            self.play_spec = EnvironmentSpec.of(make_env(**played), context.device)
+            env = make_env(**played)
+            self.play_spec = EnvironmentSpec.of(env, context.device)
+            env.close()
             if self.play_spec.actuators != context.spec.actuators:
                 raise ValueError(
                     f"method.options.play_task is {self.task}, but its actuators are not those of "
