@@ -34,7 +34,7 @@ from torchrl_etl.analysis import (
 from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
 from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths
 from torchrl_etl.io import write_atomically
-from torchrl_etl.modules.recorded_actions import LEAST_REACH
+from torchrl_etl.modules.recorded_actions import LEAST_REACH, OVERSHOOT
 from torchrl_etl.synergies import (
     SYNERGY_MODELS,
     BundleError,
@@ -145,8 +145,9 @@ def load(config: DictConfig) -> Recording:
                 "the recording, or leave normalize=false."
             )
         recording = recording._replace(activity=recording.activity / largest)
+    margin = OVERSHOOT * (config.high - config.low)
     for bound, ends in (("low", recording.activity.min(0)), ("high", recording.activity.max(0))):
-        beyond = ends < config.low if bound == "low" else ends > config.high
+        beyond = ends < config.low - margin if bound == "low" else ends > config.high + margin
         if beyond.any():
             first = int(beyond.argmax())
             raise ValueError(

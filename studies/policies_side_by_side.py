@@ -25,7 +25,7 @@ from torchrl_etl.io import write_atomically
 from torchrl_etl.training import EpisodeRecorder, resumed_config
 
 SIZE = (192, 208)  # pixels of an episode
-SECONDS = 8.0
+SECONDS = 5.0
 
 
 def main() -> None:

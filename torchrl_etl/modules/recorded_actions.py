@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 
-__all__ = ["LEAST_REACH", "as_actions", "as_bounds", "bounds_of"]
+__all__ = ["LEAST_REACH", "OVERSHOOT", "as_actions", "as_bounds", "bounds_of"]
 
 # Recordings overshoot their bounds a little: filters ring, and estimates are noisy.
 OVERSHOOT = 0.1
