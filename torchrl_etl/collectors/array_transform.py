@@ -11,7 +11,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_etl.collectors.policy_on_arrays import Arrays
 
-__all__ = ["ArrayTransform", "on_arrays"]
+__all__ = ["ArrayTransform", "has_array_form", "on_arrays"]
 
 
 @runtime_checkable
@@ -30,6 +30,11 @@ class ArrayTransform(Protocol):
 
         ``now`` has the entries of all rows so far, of which those in ``done`` [num_envs] ended.
         """
+
+
+def has_array_form(transform: Transform) -> bool:
+    """Whether :func:`on_arrays` finds the methods above."""
+    return isinstance(transform, ArrayTransform) or type(transform) in _COUNTERPARTS
 
 
 def on_arrays(transform: Transform) -> ArrayTransform | None:

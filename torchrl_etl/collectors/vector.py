@@ -25,7 +25,7 @@ from torchrl.envs import (
 from torchrl.envs.transforms import Transform
 from torchrl.modules import RandomPolicy
 
-from torchrl_etl.collectors.array_transform import ArrayTransform, on_arrays
+from torchrl_etl.collectors.array_transform import ArrayTransform, has_array_form, on_arrays
 from torchrl_etl.collectors.policy_on_arrays import Arrays, PolicyOnArrays
 
 __all__ = ["VectorCollector"]
@@ -106,6 +106,11 @@ class VectorCollector(Collector):
                 "counts, log-probabilities).",
                 stacklevel=3,
             )
+
+    @staticmethod
+    def takes(transform: Transform) -> bool:
+        """Whether the collector supports this transform."""
+        return has_array_form(transform)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the simulators and the collector's own random numbers."""

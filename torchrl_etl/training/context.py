@@ -22,7 +22,6 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_etl.checks import check_choice, check_flag, check_integer, naming
 from torchrl_etl.collectors import VectorCollector
-from torchrl_etl.collectors.array_transform import on_arrays
 from torchrl_etl.envs import EnvironmentSpec, make_env
 from torchrl_etl.extras import extra
 from torchrl_etl.learners import NORMALIZED, SACLearner
@@ -293,7 +292,7 @@ class Context:
         collector = self.options("collector")
         num_envs = collector.pop("num_envs")
         fast = num_envs > 1
-        slow = [type(each).__name__ for each in env_transforms if on_arrays(each) is None]
+        slow = [type(each).__name__ for each in env_transforms if not VectorCollector.takes(each)]
         if fast and slow:
             fast = False
             warnings.warn(
