@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from inspect import signature
@@ -77,7 +78,8 @@ class Context:
     @cached_property
     def spec(self) -> EnvironmentSpec:
         """Sizes, bounds and names of the environment."""
-        return EnvironmentSpec.of(self.make_env(), self.device)
+        with closing(self.make_env()) as env:
+            return EnvironmentSpec.of(env, self.device)
 
     def options(self, section: str) -> dict[str, Any]:
         """A section of the configuration as plain keyword arguments."""

@@ -161,6 +161,9 @@ def longest_episode(task: Mapping[str, Any], *, unlimited: int = 1000) -> int:
     Examples:
         >>> longest_episode({"name": "overactuated"})
         25
+        >>> longest_episode({"name": "overactuated", "env_kwargs": {"max_episode_steps": -1}})
+        1000
     """
-    steps = (task.get("env_kwargs") or {}).get("max_episode_steps")
-    return steps or episode_length(task["name"], task.get("goal")) or unlimited
+    given = (task.get("env_kwargs") or {}).get("max_episode_steps")
+    steps = given or episode_length(task["name"], task.get("goal"))
+    return unlimited if steps in (None, -1) else steps  # -1: Gymnasium's "no limit"
