@@ -25,8 +25,8 @@ BUDGETS = {"goals_temperature": 100_000, "kill_test": 200_000, "body": 300_000, 
 CONTROL = "sac"
 METHODS = {
     CONTROL: "SAC",
-    "etl": "ETL",
-    "etl_no_reuse": "ETL without reuse",
+    "etl": "ETL with prefill",
+    "etl_no_reuse": "ETL without",
     "etl_body": "the body's synergies",
 }
 
