@@ -27,7 +27,7 @@ METHODS = {
     CONTROL: "SAC",
     "etl": "ETL with prefill",
     "etl_no_reuse": "ETL without",
-    "etl_body": "the body's synergies",
+    "etl_body": "Body's synergies",
 }
 
 
@@ -41,7 +41,7 @@ def main() -> None:
 def table() -> Iterator[str]:
     """Lines of the table, then one sentence per method that counts its tasks."""
     comparisons = [each for folder, frames in BUDGETS.items() for each in compared(folder, frames)]
-    header = ["Task", "Frames", "Seeds", *METHODS.values(), "Best published"]
+    header = ["Task, frames", "Seeds", *METHODS.values(), "Published"]
     yield f"| {' | '.join(header)} |"
     yield f"|{'---|' * len(header)}"
     for each in comparisons:
@@ -75,8 +75,7 @@ def row(comparison: Comparison) -> tuple[str, ...]:
     seeds = "/".join("-" if result is None else str(len(result.seeds)) for result in results)
     best = best_published(environment_id(task, goal), comparison.budget)
     return (
-        f"{task}{', random goals' * (goal == 'random')}",
-        f"{comparison.budget // 1000}k",
+        f"{task}{' (random)' * (goal == 'random')}, {comparison.budget // 1000}k",
         seeds,
         *(cell(result, comparison.budget) for result in results),
         "-" if best is None else plain(best[0]),
