@@ -1,5 +1,6 @@
 #!/bin/sh
-# SAC and ETL on all 13 tasks, three seeds, a million frames, where there are a GPU and many cores.
+# SAC and ETL (without prefill, log 116) on all 13 tasks, three seeds, a million frames, where there
+# are a GPU and many cores.
 #
 #     sh studies/on_gpu.sh [FRAMES]      default: 1000000
 #     TASKS=[myoHandKeyTurn] METHODS=[sac,dynsyn] SEEDS=[0,1,2,3] \
@@ -22,6 +23,6 @@ settings="device=cuda compile=true
   evaluation.every=25000 evaluation.episodes=5 checkpoint.every=100000 log_every=5000"
 
 exec ${PYTHON:-.venv/bin/python} recipes/sweep.py "tasks=${TASKS:-[$tasks]}" \
-  "methods=${METHODS:-[sac,etl]}" "seeds=${SEEDS:-[0,1,2]}" frames="${1:-1000000}" \
+  "methods=${METHODS:-[sac,etl_no_reuse]}" "seeds=${SEEDS:-[0,1,2]}" frames="${1:-1000000}" \
   out="${OUT:-docs/results/on_gpu}" jobs="${JOBS:-1}" seeds_at_once=true \
   settings="$(echo $settings $MORE)"
