@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,15 @@ class DynSyn(Method):
     def found_groups(self, stop: StopOnSignal) -> list[int]:
         """The group of each muscle, from muscle lengths recorded under random joint motion."""
         seed, muscles = self.context.config.seed, len(self.context.spec.actuators)
-        lengths = record_muscle_lengths(
-            self.context.make_env(action_repeat=1),  # one recorded step is one frame
-            self.charged_frames,
-            amplitude=self.amplitude,
-            seed=2**30 + seed,
-            on_step=stop.check,
-        )
+        # Without action repeat, one recorded step is one frame.
+        with closing(self.context.make_env(action_repeat=1)) as env:
+            lengths = record_muscle_lengths(
+                env,
+                self.charged_frames,
+                amplitude=self.amplitude,
+                seed=2**30 + seed,
+                on_step=stop.check,
+            )
         return group_muscles(lengths, max(1, round(self.share * muscles)), seed=seed).tolist()
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import closing
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -122,8 +123,5 @@ class Method(ABC):
 
     @cached_property
     def _body(self) -> Literal["legs", "hands"]:
-        env = self.context.make_env()
-        try:
+        with closing(self.context.make_env()) as env:
             return "legs" if has_free_root(env) else "hands"
-        finally:
-            env.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from torchrl_etl.analysis import variance_accounted_for
 from torchrl_etl.baselines import best_episodes
 from torchrl_etl.checks import check_integer, check_real, naming
-from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
+from torchrl_etl.envs import EnvironmentSpec, resolve_task
 from torchrl_etl.io import write_atomically
 from torchrl_etl.learners import Term
 from torchrl_etl.methods.method import Method
@@ -68,9 +69,8 @@ class SAR(Method):
         played, self.play_spec = context.task, context.spec
         if self.task is not None:
             played |= {"name": self.task, "goal": None, "success_key": None}
-            env = make_env(**played)
-            self.play_spec = EnvironmentSpec.of(env, context.device)
-            env.close()
+            with closing(context.make_env(**played)) as env:
+                self.play_spec = EnvironmentSpec.of(env, context.device)
             if self.play_spec.actuators != context.spec.actuators:
                 raise ValueError(
                     f"method.options.play_task is {self.task}, but its actuators are not those of "
