@@ -77,7 +77,7 @@ def main(config: DictConfig) -> None:
             trained.policy, trained.env, trained.task, episodes=config.episodes
         )
         result = {"env": trained.task["name"], "goal": task.goal, **evaluation.summary()}
-    episodes = "1 episode" if config.episodes == 1 else f"{config.episodes} episodes"
+    episodes = f"{config.episodes} episode{'s' * (config.episodes > 1)}"
     print(f"{trained.task['name']}{task.goal_in_words}, deterministic policy, {episodes}")
     print_intervals(result)
     if trained.card is not None:

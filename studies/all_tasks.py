@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from torchrl_etl.analysis.published import best_published, environment_id
-from torchrl_etl.analysis.sweep_results import SweepRun, read_sweep
+from torchrl_etl.analysis.sweep_results import read_sweep
 from torchrl_etl.analysis.sweep_statistics import Comparison, MethodResult, compare
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -54,19 +54,9 @@ def table() -> Iterator[str]:
 def compared(folder: str, frames: int) -> list[Comparison]:
     """Comparisons of a folder's tasks with runs of SAC."""
     sweep = read_sweep(RESULTS / folder)
-    of_task = {
-        setting: [run for run in sweep.finished if run.setting == setting and run.method in METHODS]
-        for setting in sweep.settings
-    }
-    return [
-        compare(runs, [*METHODS], CONTROL, frames=frames, repetitions=0)
-        for runs in of_task.values()
-        if any(is_control(run) and run.last_frames >= frames for run in runs)
-    ]
-
-
-def is_control(run: SweepRun) -> bool:
-    return run.method == CONTROL
+    of_task = ([r for r in sweep.finished if r.setting == setting] for setting in sweep.settings)
+    found = [compare(r, [*METHODS], CONTROL, frames=frames, repetitions=0) for r in of_task if r]
+    return [each for each in found if each.result(CONTROL)]
 
 
 def row(comparison: Comparison) -> tuple[str, ...]:
