@@ -25,6 +25,7 @@ def row(**cells):
         "commit": "abc1234",
         "versions": '{"torch": "2.13.0"}',
         "machine": "Linux x86_64, 2 cores",
+        "settings": "learn.n_steps=3",
         "status": "finished",
     } | cells
 

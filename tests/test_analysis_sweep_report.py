@@ -82,6 +82,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
         "| fff0000 | 3 |",
         "| other \\| class | 1 |",
         "| torch | 2.13.0 | 10 |",
+        "| `learn.n_steps=3` | 10 |",
         "FlashSAC, published",
         "TD-MPC2 ignores termination",
         f"'results={folder}'",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -65,6 +66,7 @@ def test_killed_sweep_resumes_and_finishes_every_run(tmp_path):
         assert frames[method][0] == charged and frames[method][-1] >= 900
         assert len(set(frames[method])) == len(frames[method])
     assert all(float(row["wall_seconds"]) >= 0 and row["commit"] for row in rows)
+    assert all(set(SMALL) < set(shlex.split(row["settings"])) for row in rows)
 
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/summary.json")}
     assert command("sweep.py", *arguments) == 0 and len(before) == 2
@@ -136,7 +138,7 @@ def test_run_finished_in_results_csv_is_not_started(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     (tmp_path / "out").mkdir()
     row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "method": "method", "frames": "9"}
-    row["goal"] = ""
+    row |= {"goal": "", "settings": "lr=1"}
     other = row | {"seed": "7", "status": "unfinished"}
     lines = [COLUMNS, (row | {"status": "finished"}).values(), other.values()]
     text = "".join(",".join(line) + "\n" for line in lines)
@@ -146,6 +148,21 @@ def test_run_finished_in_results_csv_is_not_started(tmp_path):
         pass
     assert run.starts == 0
     assert (tmp_path / "out" / "results.csv").read_text() == text
+    other = replace(run, command=[run.command[0], "env=task", "lr=2"])
+    with pytest.raises(ValueError, match=r"one was started with other settings \(lr=1, lr=2\)"):
+        Sweep([other], tmp_path / "out", jobs=1)
+
+
+def test_table_without_settings_keeps_its_rows(tmp_path):
+    run = small_run(tmp_path, "raise SystemExit('it must not start')")
+    (tmp_path / "out").mkdir()
+    columns = [name for name in COLUMNS if name != "settings"]
+    row = dict.fromkeys(columns, "0") | {"task": "task", "goal": "", "method": "method"}
+    row |= {"frames": "9", "status": "finished"}
+    text = ",".join(columns) + "\n" + ",".join(row.values()) + "\n"
+    (tmp_path / "out" / "results.csv").write_text(text)
+    Sweep([run], tmp_path / "out", jobs=1).stop()
+    assert run.starts == 0 and results(tmp_path / "out") == [row | {"settings": ""}]
 
 
 def test_row_has_the_commit_of_the_start_that_logged_it(tmp_path):

@@ -223,8 +223,8 @@ def _unfinished(sweep: SweepResults) -> list[str]:
 
 
 def _origins(sweep: SweepResults) -> list[str]:
-    """Commits, machines and versions of the finished runs, with the number of runs of each."""
-    commits, machines, versions = Counter(), Counter(), Counter()
+    """Where the finished runs come from, with the number of runs of each origin."""
+    commits, machines, settings, versions = Counter(), Counter(), Counter(), Counter()
     mixed = []
     for run in sweep.finished:
         own = {row.commit or "unknown" for row in run.rows}
@@ -232,6 +232,7 @@ def _origins(sweep: SweepResults) -> list[str]:
         if len(own) > 1:
             mixed.append(run)
         machines.update({row.machine or "unknown" for row in run.rows})
+        settings.update({row.settings for row in run.rows if row.settings})
         versions.update({pair for row in run.rows for pair in row.versions.items()})
     parts = [
         _table(("commit", "runs"), [(name, str(n)) for name, n in sorted(commits.items())]),
@@ -241,6 +242,9 @@ def _origins(sweep: SweepResults) -> list[str]:
         parts.append("Wall times of different machines cannot be compared.")
     if mixed:
         parts.append(f"Runs with more than one commit: {_runs(mixed)}.")
+    if settings:
+        rows = [(f"`{name}`", str(n)) for name, n in sorted(settings.items())]
+        parts.append(_table(("settings", "runs"), rows))
     if versions:
         rows = [(*pair, str(count)) for pair, count in sorted(versions.items())]
         parts.append(_table(("package", "version", "runs"), rows))

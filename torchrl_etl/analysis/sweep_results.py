@@ -32,6 +32,7 @@ class SweepRow(NamedTuple):
         episodes: Number of episodes.
         wall_seconds: Seconds since the run began.
         commit, versions, machine: Origin of the numbers.
+        settings: The run's other settings, as on a command line; empty if not recorded.
         status: ``"finished"``, or another status of the run.
     """
 
@@ -49,10 +50,12 @@ class SweepRow(NamedTuple):
     commit: str
     versions: Mapping[str, str]
     machine: str
+    settings: str
     status: str
 
 
 COLUMNS = tuple("return" if name == "mean_return" else name for name in SweepRow._fields[1:])
+REQUIRED = tuple(name for name in COLUMNS if name != "settings")  # older files lack it
 
 
 @dataclass(frozen=True)
@@ -160,11 +163,11 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
         raise FileNotFoundError(f"{folder} has no {RESULTS}; pass the folder that the sweep wrote.")
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+        missing = [name for name in REQUIRED if name not in (reader.fieldnames or ())]
         if reader.fieldnames and missing:
             raise ValueError(
                 f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}; it needs "
-                f"{', '.join(COLUMNS)}."
+                f"{', '.join(REQUIRED)}."
             )
         rows = [_row(path, reader.line_num, cells) for cells in reader]
     if not rows:
@@ -204,7 +207,7 @@ def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> SweepRow:
             f"{where}: the line does not have as many cells as the header; complete or delete it "
             "(a writer that was killed leaves half a line)."
         )
-    text = {name: cells[name].strip() for name in COLUMNS}
+    text = {name: cells.get(name, "").strip() for name in COLUMNS}
     for name in ("task", "method", "status"):
         if not text[name]:
             raise ValueError(f"{where}: {name} is empty; every evaluation needs one.")

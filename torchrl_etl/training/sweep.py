@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ __all__ = ["Run", "Sweep", "end_with_parent"]
 
 SETTINGS = "settings.txt"
 KEY = ("task", "goal", "method", "seed")
+SET_BY_KEY = ("env=", "goal=", "method=", "seed=")
 EARLIER_STAGES = ("explore", "play")
 
 
@@ -76,18 +78,22 @@ class Run:
     def has_begun(self) -> bool:
         return (self.path / "config.yaml").is_file()
 
-    def check_settings(self) -> None:
-        """Check that the run in this folder has these settings.
+    def check_settings(self, rows: Sequence[Mapping[str, str]] = ()) -> None:
+        """Check that the run in this folder, or in rows of a table, has these settings.
 
         Raises:
             ValueError: if it was started with other settings.
         """
         path, asked = self.path / SETTINGS, self.command[1:]
-        begun = path.read_text("utf-8").splitlines() if path.is_file() else asked
-        if self.has_begun and (other := sorted(set(begun) ^ set(asked))):
+        begun = path.read_text("utf-8").splitlines() if self.has_begun and path.is_file() else asked
+        other = {*begun} ^ {*asked}
+        for row in rows:
+            if _key(row) == self.key and (known := row.get("settings")):
+                other |= {*shlex.split(known)} ^ {*self.other_settings}
+        if other:
             raise ValueError(
-                f"{self.path} was started with other settings ({', '.join(other)}); pass another "
-                "out=FOLDER, or the settings that it was started with."
+                f"{self.path} was started with other settings ({', '.join(sorted(other))}); pass "
+                "another out=FOLDER, or the settings that it was started with."
             )
 
     @property
@@ -116,6 +122,11 @@ class Run:
         return tuple(each for each in self.command[1:] if not each.startswith("seed="))
 
     @property
+    def other_settings(self) -> tuple[str, ...]:
+        """Settings in its command that no column of its rows' key holds."""
+        return tuple(each for each in self.command[1:] if not each.startswith(SET_BY_KEY))
+
+    @property
     def stem(self) -> str:
         """Its path without a seed at the end."""
         return str(self.path).removesuffix(str(self.seed))
@@ -131,7 +142,7 @@ class Run:
         if folder is None or not (starts := folder.versions):
             return
         own: dict[str, Any] = {"task": self.task, "goal": self.goal, "method": self.method}
-        own |= {"seed": self.seed, "status": status}
+        own |= {"seed": self.seed, "status": status, "settings": shlex.join(self.other_settings)}
         before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
         own["episodes"] = self.episodes
         series = {
@@ -220,9 +231,10 @@ class Sweep:
         attempts: int = 3,
         seeds_at_once: bool = False,
     ) -> None:
-        for run in runs:
-            run.check_settings()
         self.runs, self.folder, self.jobs, self.attempts = runs, Path(folder), jobs, attempts
+        rows = self._read()
+        for run in runs:
+            run.check_settings(rows)
         self.seeds_at_once = seeds_at_once
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.folder / ".lock")
