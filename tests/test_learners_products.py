@@ -8,13 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchrl_etl.learners import products
 from torchrl_etl.learners.compiled import compiled
-from torchrl_etl.learners.products import faster_products, product
+from torchrl_etl.learners.products import faster_products, is_amd, product
 
 
-@pytest.fixture(params=["AVX512", "AVX2"])
-def capability(request, monkeypatch):
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: request.param)
+@pytest.fixture(params=[("AVX512", True), ("AVX512", False), ("AVX2", True)], ids=str)
+def processor(request, monkeypatch):
+    """Vector instructions, and whether the processor is AMD's."""
+    capability, amd = request.param
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    monkeypatch.setattr(products, "is_amd", lambda: amd)
     faster_products.cache_clear()
     yield request.param
     faster_products.cache_clear()
@@ -37,12 +41,21 @@ def test_product_equals_pytorchs(left, right, bias):
     torch.testing.assert_close(product(a, b, bias), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_products_are_replaced_only_with_avx_512(capability):
-    assert bool(faster_products()) == (capability == "AVX512")
+def test_products_are_replaced_only_with_avx_512_on_amds_processors(processor):
+    assert bool(faster_products()) == (processor == ("AVX512", True))
+
+
+def test_vendor_is_read_from_what_the_system_tells(tmp_path, monkeypatch):
+    (tmp_path / "intel").write_text("processor\t: 0\nvendor_id\t: GenuineIntel\n")
+    (tmp_path / "amd").write_text("processor\t: 0\nvendor_id\t: AuthenticAMD\n")
+    assert is_amd(tmp_path / "amd") and not is_amd(tmp_path / "intel")
+    name = "AMD64 Family 25 Model 1 Stepping 1, AuthenticAMD"
+    monkeypatch.setattr(products.platform, "processor", lambda: name)
+    assert is_amd(tmp_path / "no such file")
 
 
 @pytest.mark.slow
-def test_compiled_gradients_of_large_and_small_products_equal_eager_ones(capability):
+def test_compiled_gradients_of_large_and_small_products_equal_eager_ones(processor):
     features = torch.randn(64, 33)
     weights = [
         torch.randn(n, m).div(m**0.5).requires_grad_() for n, m in ((40, 66), (40, 40), (1, 40))

@@ -1,20 +1,22 @@
 """Matrix products of a compiled update through oneDNN where it is faster than MKL.
 
 On AMD processors MKL, PyTorch's default (torch 2.13), does not use AVX-512 and runs at half the
-speed of oneDNN. PyTorch includes oneDNN but has no public function for it. Where oneDNN is used,
-products with a single row or column become sums.
+speed of oneDNN. On Intel's it does, and is faster. PyTorch includes oneDNN but has no public
+function for it. Where oneDNN is used, products with a single row or column become sums.
 """
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["by_onednn", "faster_products", "multiply"]
+__all__ = ["by_onednn", "faster_products", "is_amd", "multiply"]
 
 _SMALLEST = 16  # of m, k and n each; below, MKL is faster
 
@@ -36,10 +38,10 @@ def _(a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
 def faster_products() -> dict[Any, Callable[..., Any]]:
     """Decompositions of products for :func:`~torch.fx.experimental.proxy_tensor.make_fx`.
 
-    Empty where oneDNN is not known to be faster: without AVX-512 both are about equally fast.
+    Empty where oneDNN is not known to be faster: it is with AVX-512 on AMD's processors.
     """
-    capability = torch.backends.cpu.get_cpu_capability()
-    if capability != "AVX512" or not torch.backends.mkldnn.is_available():
+    avx512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
+    if not (avx512 and torch.backends.mkldnn.is_available() and is_amd()):
         return {}
     from torch._inductor.ir import ExternKernel
     from torch._inductor.lowering import fallback_handler, permute, register_lowering
@@ -54,6 +56,15 @@ def faster_products() -> dict[Any, Callable[..., Any]]:
         return call(ExternKernel.require_contiguous(a), permute(b, [1, 0]), bias, "none", [], "")
 
     return {torch.ops.aten.mm.default: _mm, torch.ops.aten.addmm.default: _addmm}
+
+
+def is_amd(cpuinfo: Path = Path("/proc/cpuinfo")) -> bool:
+    """Whether the processor is AMD's, as far as the system tells."""
+    try:
+        text = cpuinfo.read_text(encoding="utf-8")
+    except OSError:
+        text = platform.processor()  # names the vendor on Windows
+    return "AuthenticAMD" in text
 
 
 def by_onednn(a: Tensor, b: Tensor) -> bool:
