@@ -14,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from filelock import FileLock, Timeout
 from torchrl.record.loggers import Logger, TensorboardLogger, get_logger
 
@@ -236,7 +237,8 @@ def facts() -> dict[str, Any]:
     for name in _PACKAGES:  # even torchrl_etl may not be installed, in a checkout
         with suppress(PackageNotFoundError):
             found[name] = version(name)
-    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    simd = torch.backends.cpu.get_cpu_capability()  # decides rounding and speed of products
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores, {simd}"
     return {**found, "machine": machine}
 
 
