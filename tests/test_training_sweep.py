@@ -153,6 +153,27 @@ def test_run_finished_in_results_csv_is_not_started(tmp_path):
         Sweep([other], tmp_path / "out", jobs=1)
 
 
+@pytest.mark.parametrize("frames", [9, 18])
+def test_rows_of_a_finished_run_stay_until_its_folder_has_as_many_frames(frames, tmp_path):
+    """A run was killed here and finished on another machine, whose table was copied."""
+    run = replace(small_run(tmp_path, ""), frames=frames)
+    log = run.path / "csv" / "scalars" / "learn" / "eval" / "return.csv"
+    log.parent.mkdir(parents=True)
+    log.write_text("0,1.0\n")
+    (run.path / "config.yaml").write_text("evaluation: {episodes: 1}")
+    (run.path / "versions.json").write_text('[{"commit": "a", "machine": "m"}]')
+    row = dict.fromkeys(COLUMNS, "0") | {"task": "task", "goal": "", "method": "method"}
+    row |= {"frames": "9", "settings": "lr=1", "status": "finished"}
+    text = ",".join(COLUMNS) + "\n" + ",".join(row.values()) + "\n"
+    (tmp_path / "out" / "results.csv").write_text(text)
+    sweep = Sweep([run], tmp_path / "out", jobs=1)
+    sweep.write()
+    assert (tmp_path / "out" / "results.csv").read_text() == text
+    log.write_text("0,1.0\n12,2.0\n")
+    sweep.stop()
+    assert [row["frames"] for row in results(tmp_path / "out")] == ["0", "12"]
+
+
 def test_table_without_settings_keeps_its_rows(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     (tmp_path / "out").mkdir()

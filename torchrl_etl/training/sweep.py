@@ -307,7 +307,12 @@ class Sweep:
 
         A run without an evaluation that has not finished gets a row without a return.
         """
-        rows = [row for run in self.runs for row in run.rows(self.status(run))]
+        rows: list[dict[str, Any]] = []
+        for run in self.runs:
+            own = list(run.rows(self.status(run)))
+            # Rows of a run that finished elsewhere stay until this folder's run is as long.
+            if own and own[-1]["frames"] >= self._done.get(run.key, 0):
+                rows += own
         mine = {_key(row) for row in rows}
         known = mine | {_key(row) for row in self._earlier}
         for run in self.runs:
