@@ -174,6 +174,16 @@ def test_rows_of_a_finished_run_stay_until_its_folder_has_as_many_frames(frames,
     assert [row["frames"] for row in results(tmp_path / "out")] == ["0", "12"]
 
 
+@pytest.mark.parametrize("columns", [(*COLUMNS, "note"), COLUMNS[1:]])
+def test_table_with_other_columns_is_refused(columns, tmp_path):
+    run = small_run(tmp_path, "raise SystemExit('it must not start')")
+    (tmp_path / "out").mkdir()
+    text = "".join(",".join(line) + "\n" for line in (columns, "0" * len(columns)))
+    (tmp_path / "out" / "results.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"has the columns .* it must have task, goal"):
+        Sweep([run], tmp_path / "out", jobs=1)
+
+
 def test_table_without_settings_keeps_its_rows(tmp_path):
     run = small_run(tmp_path, "raise SystemExit('it must not start')")
     (tmp_path / "out").mkdir()

@@ -218,7 +218,8 @@ class Sweep:
             alone. Default: ``False``.
 
     Raises:
-        ValueError: if a run was started earlier with other settings.
+        ValueError: if a run was started earlier with other settings, or the table in the folder has
+            other columns.
         RuntimeError: if another queue uses this folder.
     """
 
@@ -331,7 +332,14 @@ class Sweep:
         if not path.is_file():
             return []
         with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            rows, columns = list(reader), reader.fieldnames or COLUMNS
+        if {*columns, "settings"} != {*COLUMNS}:  # older files lack it
+            raise ValueError(
+                f"{path} has the columns {', '.join(columns)}; it must have "
+                f"{', '.join(COLUMNS)}, so mend or rename it, or pass another out=FOLDER."
+            )
+        return rows
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
