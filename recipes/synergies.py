@@ -127,11 +127,13 @@ def check_folder(folder: Path) -> None:
 
 
 def check_recording(folder: Path, digest: str) -> None:
-    """Reject a folder with results of another recording; files in two folders may share a name."""
+    """Reject a folder with synergies of another recording, or of a run."""
     if (folder / "synergies").is_dir():
         with suppress(BundleError):  # a damaged bundle is replaced
-            if digest != read_description(folder / "synergies").facts.get("recording", digest):
-                raise ValueError(f"{folder} holds synergies of another recording; pass out=FOLDER.")
+            facts = read_description(folder / "synergies").facts
+            if digest != facts.get("recording"):
+                of = "another recording" if "recording" in facts else "a run"
+                raise ValueError(f"{folder} holds synergies of {of}; pass out=FOLDER.")
 
 
 def load(config: DictConfig) -> Recording:

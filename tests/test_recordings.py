@@ -12,7 +12,14 @@ import torch
 
 from tests.commands import command
 from torchrl_etl.analysis import cross_validate, held_out_rows, variance_accounted_for
-from torchrl_etl.synergies import NMFSynergies, fit_synergies, load_bundle, read_recording
+from torchrl_etl.modules import SynergyDecoder
+from torchrl_etl.synergies import (
+    NMFSynergies,
+    fit_synergies,
+    load_bundle,
+    read_recording,
+    save_bundle,
+)
 
 MUSCLES = tuple(f"m{i}" for i in range(6))
 
@@ -226,7 +233,7 @@ def test_command_writes_table_bundle_and_pictures(tmp_path, monkeypatch, capsys)
         assert (folder / "pictures" / name).stat().st_size > 5_000
 
 
-def test_results_of_another_recording_are_not_overwritten(tmp_path, monkeypatch, capsys):
+def test_synergies_of_another_recording_or_a_run_are_not_overwritten(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for subject, rows in (("S01", 40), ("S02", 50)):
         Path(subject).mkdir()
@@ -237,6 +244,10 @@ def test_results_of_another_recording_are_not_overwritten(tmp_path, monkeypatch,
     assert command(*second) == 2
     assert "runs/emg-pca holds synergies of another recording; pass out=" in capsys.readouterr().err
     assert Path("runs/emg-pca/vaf.csv").read_bytes() == before
+    of_a_run = save_bundle(SynergyDecoder(1, 2), "run/synergies", task="toy", actuators=["a", "b"])
+    assert command(*first, "out=run") == 2
+    assert "run holds synergies of a run; pass out=FOLDER" in capsys.readouterr().err
+    assert load_bundle(of_a_run)[1].task == "toy"
 
 
 @pytest.mark.parametrize(
