@@ -8,6 +8,7 @@ None of them was measured here, and no spread over seeds was published.
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -19,6 +20,9 @@ from torchrl_etl.envs import list_tasks
 __all__ = ["PublishedCurve", "best_published", "caveats", "environment_id", "published_curves"]
 
 _NAMES = {"simbaV2": "SimbaV2", "xqc": "XQC", "tdmpc2": "TD-MPC2", "mrq": "MR.Q"}
+
+# Names of MyoSuite 3's task, the first of which stands for all.
+_NEW_HAND_POSE = ("myoHandPose", "myoHandPoseFixed-v0", "myoHandPoseRandom-v0")
 
 # Episodes of varying length put evaluations slightly off round numbers of frames.
 _TOLERANCE = 0.05
@@ -57,16 +61,18 @@ def environment_id(task: str, goal: str = "fixed") -> str:
     Examples:
         >>> environment_id("myoHandKeyTurn", "random"), environment_id("dog-run")
         ('myoHandKeyTurnRandom-v0', 'dog-run')
-        >>> environment_id("myo2HandPose"), environment_id("myoHandPose")
-        ('myoHandPoseFixed-v0', 'myoHandPose')
+        >>> environment_id("myo2HandPose"), environment_id("torchrl_etl/Myo2HandPoseFixed-v0")
+        ('myoHandPoseFixed-v0', 'myoHandPoseFixed-v0')
+        >>> environment_id("myoHandPose"), environment_id("myoHandPoseFixed-v0")
+        ('myoHandPose', 'myoHandPose')
     """
-    if task == "myoHandPose":
-        return task
-    name = "myoHandPose" if task == "myo2HandPose" else task
+    if task in _NEW_HAND_POSE:
+        return _NEW_HAND_POSE[0]
+    name = re.sub(r"^(torchrl_etl/M|m)yo2", "myo", task)
     for known in list_tasks():
         if known.name == name:
             return replace(known, goal=goal).env_id
-    return task
+    return name
 
 
 def published_curves(env_id: str, metric: str = "return") -> tuple[PublishedCurve, ...]:
