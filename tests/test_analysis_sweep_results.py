@@ -28,8 +28,10 @@ def test_row_before_the_first_evaluation_gives_way_to_evaluations(tmp_path):
     waiting = row(status="waiting", **{"return": ""})
     (first,) = read_sweep(write(tmp_path / "first", [waiting])).runs
     assert first.status == "waiting" and not first.evaluated
-    (later,) = read_sweep(write(tmp_path / "later", [waiting, row(frames=320)])).runs
+    results = read_sweep(write(tmp_path / "later", [waiting, row(frames=320)]))
+    (later,) = results.runs
     assert later.finished and [each.frames for each in later.rows] == [320]
+    assert results.row_count == 1 and results.replaced == 0
 
 
 def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):

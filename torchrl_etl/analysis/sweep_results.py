@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -119,7 +119,7 @@ class SweepResults:
     Attributes:
         runs: All runs, including unfinished ones.
         row_count: Number of evaluations in the file.
-        replaced: Number of rows superseded by a repeated run.
+        replaced: Number of evaluations superseded by a repeated run.
     """
 
     runs: tuple[SweepRun, ...]
@@ -174,15 +174,19 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
         raise ValueError(f"{path} has no rows; evaluate at least one run first.")
     runs, kept = _runs(rows), 0
     for run in runs:
-        kept += len(run.rows)
+        kept += _evaluations(run.rows)
         for row in run.rows:
             if run.finished and not math.isfinite(row.mean_return):
                 raise ValueError(
                     f"{path}, line {row.line}: {run} is finished but this evaluation has no finite "
                     "return; fix the row, or give the run's last row another status."
                 )
-    evaluations = sum(math.isfinite(row.mean_return) for row in rows)
-    return SweepResults(runs, evaluations, len(rows) - kept)
+    evaluations = _evaluations(rows)
+    return SweepResults(runs, evaluations, evaluations - kept)
+
+
+def _evaluations(rows: Iterable[SweepRow]) -> int:
+    return sum(math.isfinite(row.mean_return) for row in rows)
 
 
 def _runs(rows: list[SweepRow]) -> tuple[SweepRun, ...]:
