@@ -41,6 +41,12 @@ def test_settings_come_in_the_papers_order_and_unknown_tasks_last(tmp_path):
     assert {goal for _, goal in results.settings} == {"fixed"}
 
 
+def test_empty_goal_is_that_of_the_id(tmp_path):
+    tasks = ("myoHandKeyTurn", "myoHandKeyTurnRandom-v0")
+    results = sweep(tmp_path, *(run([0, 1], task=task, goal="") for task in tasks))
+    assert results.settings == (("myoHandKeyTurn", "fixed"), ("myoHandKeyTurnRandom-v0", "random"))
+
+
 @pytest.mark.parametrize(
     ("cells", "words"),
     [

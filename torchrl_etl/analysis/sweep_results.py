@@ -25,7 +25,7 @@ class SweepRow(NamedTuple):
 
     Attributes:
         line: Line number in the file.
-        task, goal, method, seed: The run.
+        task, goal, method, seed: The run; an empty goal is the one that an id names, else fixed.
         frames: Environment frames so far, including exploration.
         mean_return: Mean undiscounted return over the evaluation's episodes.
         solved, solved_time: Shares in [0, 1] of solved episodes and solved steps.
@@ -216,7 +216,7 @@ def _row(path: Path, line: int, cells: Mapping[str | None, Any]) -> SweepRow:
         if not text[name]:
             raise ValueError(f"{where}: {name} is empty; every evaluation needs one.")
     read = {name: parse(where, name, text[name]) for name, parse in _PARSERS.items()}
-    goal = text["goal"] or "fixed"
+    goal = text["goal"] or ("random" if "Random" in text["task"] else "fixed")
     return SweepRow(line, *(text | read | {"goal": goal}).values())
 
 
