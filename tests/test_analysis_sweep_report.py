@@ -101,6 +101,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
         (["results={}", "control=sca"], 2, "control=sca has no finished run; did you mean sac?"),
         (["results={}", "control=zzz"], 2, "there are sac."),
         (["results={}", "frames=-5"], 2, "frames is '-5'; it must be a whole number, 1 or more"),
+        (["results={}", "frames=60000"], 2, "no finished run has an evaluation; the longest run"),
         (["results={}/nowhere"], 2, "There is no folder"),
         ([], 2, "no results are given"),
         (["result={}"], "did you mean results?", ""),
@@ -114,6 +115,7 @@ def test_wrong_arguments_end_in_one_line_of_error(tmp_path, capsys, arguments, c
     if isinstance(code, int):
         message = capsys.readouterr().err
         assert exit_.value.code == code and words in message and message.count("\n") == 1
+        assert not (folder / "report.md").exists()
     else:
         assert code in exit_.value.code
 
