@@ -73,7 +73,7 @@ def test_report_from_end_to_end(tmp_path, capsys):
         "No run of eme finished.",
         "etl lacks dog-run (fixed)",
         "dep lacks myoHandKeyTurn (fixed)",
-        "No finished run reached the budget: etl.",
+        "No finished run to compare at the budget: etl.",
         "unequal numbers of seeds",
         "- myoHandKeyTurn (fixed), etl, seed 9: killed: out of memory, last evaluated at 100,000",
         "- dog-walk (fixed), eme, seed 0: diverged, last evaluated at 50,000 frames",

@@ -45,6 +45,14 @@ def test_runs_shorter_than_a_given_budget_are_left_out(tmp_path):
     assert [one.method for one in comparison.ended_early] == ["etl"]
 
 
+def test_runs_first_evaluated_after_a_given_budget_are_left_out(tmp_path):
+    explored = run([5, 6], [8_000, 10_000], method="etl")
+    runs = sweep(tmp_path, run([0, 1, 2], [0, 5_000, 10_000]), explored).runs
+    comparison = compare(runs, ["sac", "etl"], "sac", frames=5_000, repetitions=FEW)
+    assert comparison.result("etl") is None and not comparison.ended_early
+    assert [one.method for one in comparison.evaluated_late] == ["etl"]
+
+
 def test_frames_to_the_controls_return_use_the_mean_over_seeds(tmp_path):
     frames = [0, 10, 20, 30]
     results = sweep(

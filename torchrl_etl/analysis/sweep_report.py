@@ -184,11 +184,15 @@ def _task(comparison: Comparison, methods: Sequence[str], control: str) -> list[
     notes = []
     absent = [name for name in methods if comparison.result(name) is None]
     if absent:
-        notes.append(f"No finished run reached the budget: {', '.join(absent)}.")
+        notes.append(f"No finished run to compare at the budget: {', '.join(absent)}.")
     if len({len(result.seeds) for result in comparison.results}) > 1:
         notes.append("The methods have unequal numbers of seeds.")
     if comparison.ended_early:
         notes.append(f"Left out, ended before the budget: {_runs(comparison.ended_early)}.")
+    if comparison.evaluated_late:
+        notes.append(
+            f"Left out, first evaluated after the budget: {_runs(comparison.evaluated_late)}."
+        )
     if comparison.evaluated_early:
         notes.append(
             "Represented by an evaluation more than 5 % before the budget: "

@@ -60,6 +60,8 @@ class Comparison:
         untrained: Mean return of the evaluations at ``untrained_frames``, over all runs.
         untrained_frames: The smallest number of frames at which a run was evaluated; usually 0.
         ended_early: Runs left out because they ended before the budget.
+        evaluated_late: Runs left out because they were first evaluated after the budget, such as
+            those of a method that explores for longer.
         evaluated_early: Runs whose last evaluation within the budget is more than 5 % before it.
     """
 
@@ -69,6 +71,7 @@ class Comparison:
     untrained: float
     untrained_frames: int
     ended_early: tuple[SweepRun, ...]
+    evaluated_late: tuple[SweepRun, ...]
     evaluated_early: tuple[SweepRun, ...]
 
     def result(self, method: str) -> MethodResult | None:
@@ -113,11 +116,9 @@ def compare(
     if len({run.setting for run in runs}) != 1:
         raise ValueError("The runs must be of one task and goal; pass at least one, and no others.")
     budget = common_budget(runs) if frames is None else frames
-    fair = [
-        run
-        for run in runs
-        if run.last_frames >= (1 - _TOLERANCE) * budget and run.evaluation_at(budget)
-    ]
+    ended_early = [run for run in runs if run.last_frames < (1 - _TOLERANCE) * budget]
+    evaluated_late = [run for run in runs if run.evaluation_at(budget) is None]
+    fair = [run for run in runs if run not in (*ended_early, *evaluated_late)]
     by_method = {name: [run for run in fair if run.method == name] for name in methods}
     baseline = [run.evaluation_at(budget).mean_return for run in by_method.get(control, ())]
     first = min(run.rows[0].frames for run in runs)
@@ -132,7 +133,8 @@ def compare(
         ),
         untrained=float(np.mean(untrained)),
         untrained_frames=first,
-        ended_early=tuple(run for run in runs if run not in fair),
+        ended_early=tuple(ended_early),
+        evaluated_late=tuple(evaluated_late),
         evaluated_early=tuple(run for run in fair if _evaluated_early(run, budget)),
     )
 
