@@ -72,7 +72,7 @@ def main(config: DictConfig) -> None:
             )
         trained = of_a_run(config) if config.zoo is None else of_the_zoo(config)
         recorder = open_recorder(config, trained.env, size) if config.video else None
-        task = resolve_task(trained.task["name"], trained.task["goal"])
+        task = resolve_task(trained.task["name"], trained.task.get("goal"))
         evaluation = evaluate_task(
             trained.policy, trained.env, trained.task, episodes=config.episodes
         )
@@ -80,7 +80,7 @@ def main(config: DictConfig) -> None:
     episodes = f"{config.episodes} episode{'s' * (config.episodes > 1)}"
     print(f"{trained.task['name']}{task.goal_in_words}, deterministic policy, {episodes}")
     print_intervals(result)
-    if trained.card is not None:
+    if trained.card is not None and trained.card.evaluation:
         print(f"  {beside(trained.card, evaluation)}")
     path = trained.folder / "evaluation.json"
     with exit_on_error(OSError):  # now that the numbers are told
@@ -156,9 +156,10 @@ def beside(card: zoo.Card, evaluation: Evaluation) -> str:
     if same == len(pairs):
         return f"same return as on its card in each of {same} episodes"
     mean, low, high = card.evaluation["return"].values()
+    interval = "" if low is None else f" ({low:.3f} to {high:.3f})"  # none for a single episode
     return (
         f"{len(pairs) - same} of {len(pairs)} episodes differ from its card, which has the return "
-        f"{mean:.3f} ({low:.3f} to {high:.3f}); other machines and simulators round differently"
+        f"{mean:.3f}{interval}; other machines and simulators round differently"
     )
 
 

@@ -319,6 +319,29 @@ def test_export_and_evaluate_commands(run, tmp_path, monkeypatch, capsys):
         zoo.load("hand")
 
 
+@pytest.mark.parametrize(
+    ("evaluation", "said"),
+    [
+        (
+            {
+                "return": {"mean": 1.0, "low": None, "high": None},
+                "episodes": {"returns": [1.0]},
+            },
+            "1 of 1 episodes differ from its card, which has the return 1.000;",
+        ),
+        ({}, "evaluation.json"),
+    ],
+)
+def test_evaluate_reads_a_card_of_one_episode_or_none(
+    evaluation, said, exported, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(exported, tmp_path / "toy")
+    rewrite(tmp_path / "toy", evaluation=evaluation, task={"name": "overactuated"})
+    monkeypatch.chdir(tmp_path)
+    assert command("evaluate.py", "zoo=toy", "episodes=1") == 0
+    assert said in capsys.readouterr().out
+
+
 def test_entry_of_a_custom_task_requires_env_from_the_user(exported, tmp_path, monkeypatch, capsys):
     shutil.copytree(exported, tmp_path / "toy")
     task = json.loads((tmp_path / "toy" / "card.json").read_text())["task"]
