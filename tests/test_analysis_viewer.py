@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
+from torchrl_etl import zoo
 from torchrl_etl.analysis.viewer import Session, Subject
 from torchrl_etl.analysis.viewer.framing import SHOWN_GROUPS, seen
 from torchrl_etl.analysis.viewer.html import activation_grid, driven_list, status
@@ -92,16 +93,23 @@ def test_sliders_continue_past_the_end_and_the_policy_starts_an_episode():
     assert (session.episode, session.steps) == (1, 1)
 
 
-def test_episode_equals_that_of_evaluate():
-    decoder = make_decoder()
-    policy = constant_policy(0.3, decoder)
-    session = open_session(decoder=decoder, policy=policy)
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_episode_equals_that_of_evaluate(repeat):
+    policy, env = zoo.load("overactuated", env=make_env("overactuated", action_repeat=repeat))
+    parts = {
+        "make_env": lambda goal: env,
+        "episode_steps": -(-25 // repeat),
+        "action_repeat": repeat,
+    }
+    session = open_session(policy=policy, **parts)
     session.reset(1)
     while not session.over:
         session.step()
-    found = evaluate(policy, make_env("overactuated"), episodes=2, max_steps=25, seed=7)
+    options = {"max_steps": 25, "action_repeat": repeat, "solved_steps": 6, "seed": 7}
+    found = evaluate(policy, env, episodes=2, **options)
     assert session.total_reward == pytest.approx(found.returns[1])
-    assert session.solved_steps == found.solved_steps[1]
+    assert session.solved_steps == found.solved_steps[1] > 6
+    assert session.success == found.successes[1]
 
 
 def test_sliders_show_the_policys_coefficients():

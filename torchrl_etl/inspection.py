@@ -45,6 +45,7 @@ def open_run(run: Path, *, defaults: DictConfig | None = None) -> Subject:
         context.spec.actuators,
         episode_steps=math.ceil(longest_episode(context.task) / context.config.action_repeat),
         first_seed=EVALUATION_SEED,
+        action_repeat=context.config.action_repeat,
     )
     subject = _with_explorer(_with_policy(subject, experiment), experiment)
     if not subject.drivers:
@@ -125,6 +126,7 @@ def open_zoo(name: str, env: str | None = None) -> Subject:
     simulator.close()
     of_task = dict(card.task)
     task = resolve_task(of_task.pop("name"), of_task.pop("goal", None))
+    action_repeat = of_task.get("action_repeat", 1)
     return Subject(
         f"zoo={name}",
         task,
@@ -132,8 +134,9 @@ def open_zoo(name: str, env: str | None = None) -> Subject:
         card.actuators,
         decoder=next((part for part in policy.modules() if isinstance(part, SynergyMap)), None),
         policy=policy,
-        episode_steps=math.ceil(longest_episode(card.task) / of_task.get("action_repeat", 1)),
+        episode_steps=math.ceil(longest_episode(card.task) / action_repeat),
         first_seed=EVALUATION_SEED,
+        action_repeat=action_repeat,
     )
 
 

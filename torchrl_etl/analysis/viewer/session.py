@@ -50,6 +50,7 @@ class Subject:
         episode_steps (int, optional): step limit of an episode, if the environment does not
             truncate earlier.
         first_seed (int): seed of episode 0.
+        action_repeat (int): simulator steps per step of the environment; solved steps count these.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Subject:
     direction_dim: int = 0
     episode_steps: int | None = None
     first_seed: int = 0
+    action_repeat: int = 1
 
     @property
     def drivers(self) -> list[Driver]:
@@ -247,7 +249,7 @@ class Session:
         self.total_reward += outcome["reward"].item()
         if self.solved is not None:
             self.solved = bool(outcome["solved"].any())
-            self.solved_steps += self.solved
+            self.solved_steps += self.subject.action_repeat * self.solved
         limit = self.subject.episode_steps
         self.over = bool(outcome["done"].any()) or (limit is not None and self.steps >= limit)
         self._state = step_mdp(after, keep_other=False)
