@@ -294,6 +294,11 @@ def test_damaged_or_foreign_entry_gives_a_one_line_error(damage, words, entry):
     assert "\n" not in str(caught.value)
 
 
+def test_entry_whose_replacement_was_interrupted_is_found(entry):
+    entry.rename(entry.with_name(f".{entry.name}.previous"))
+    zoo.load(entry)
+
+
 def test_policy_on_another_body_is_refused(exported):
     with pytest.raises(ZooError, match=r"reads 6 observations and the environment gives"):
         zoo.load(exported, env=make_env("cheetah-run"))

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import choose_one, not_finite
 from torchrl_etl.envs import EnvironmentSpec, make_env, resolve_task
-from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder
+from torchrl_etl.io import read_bytes, replace_folder, replaceable_folder, surviving_folder
 from torchrl_etl.modules import SynergyMap
 from torchrl_etl.synergies.bundle import BUNDLE_FILES, bundle_files
 from torchrl_etl.synergies.bundle_info import some
@@ -70,6 +70,8 @@ def find(name: str | os.PathLike[str]) -> Path:
     if (given := os.fspath(name)) in names():
         return ENTRIES / given
     folder = Path(given).expanduser()
+    if not folder.is_dir():  # perhaps a crash interrupted its replacement
+        folder = surviving_folder(folder.resolve())
     if not folder.is_dir():
         raise ZooError(
             f"The zoo has no {given!r}; {choose_one(given, names())}, or pass the folder of "
