@@ -202,6 +202,12 @@ def test_interrupted_save_keeps_the_old_bundle(bundle, monkeypatch, survives, ki
     assert os.listdir(bundle.parent) == ["synergies"]
 
 
+def test_tilde_is_the_home_folder_in_every_path(bundle, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert copy_bundle(bundle, "~/copy") == tmp_path / "copy"
+    assert load_bundle("~/copy")[1] == load_bundle(bundle)[1]
+
+
 def test_saving_refuses_to_overwrite_other_files(bundle):
     run = bundle.parent
     with pytest.raises(BundleError, match="holds 'synergies', and saving a bundle there would"):

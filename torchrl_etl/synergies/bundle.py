@@ -240,7 +240,7 @@ def copy_bundle(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         >>> info.task
         'toy'
     """
-    files, target = bundle_files(source), Path(target).resolve()
+    files, target = bundle_files(source), Path(target).expanduser().resolve()
     if _find_folder(Path(source)) != target:
         replace_folder(replaceable_folder(target, BUNDLE_FILES, "a bundle", BundleError), files)
     return target
@@ -279,7 +279,7 @@ def _plain(value: Any, where: str) -> Any:
 
 def _find_folder(path: Path) -> Path:
     for candidate in (path, path / "synergies"):
-        folder = surviving_folder(candidate.resolve())
+        folder = surviving_folder(candidate.expanduser().resolve())
         if (folder / DESCRIPTION).exists() or (folder / _TENSORS).exists():
             return folder
     raise BundleError(
