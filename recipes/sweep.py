@@ -122,7 +122,8 @@ def compose(overrides: Sequence[str]) -> DictConfig:
     """The configuration that ``etl_sac.py`` composes from these overrides."""
     hydra.core.global_hydra.GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        return hydra.compose("config", [*translate(overrides, CONF), "run_dir=unused"])
+        translated = quote_paths(translate(overrides, CONF), "synergies.bundle")
+        return hydra.compose("config", [*translated, "run_dir=unused"])
 
 
 class Display:

@@ -315,6 +315,11 @@ def test_sweep_takes_a_custom_task_with_a_random_goal(recipe, tmp_path, monkeypa
     assert random.path.name == "queue_tasks-QueueReachRandom-v0-random-sac-seed0"
 
 
+def test_settings_take_the_path_of_a_bundle_as_etl_sac_does(recipe):
+    overrides = ["env=overactuated", "synergies=/my (new) runs/a"]
+    assert recipe.compose(overrides).synergies.bundle == "/my (new) runs/a"
+
+
 @pytest.fixture(scope="module")
 def recipe():
     return recipe_module("sweep")
