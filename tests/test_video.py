@@ -85,6 +85,15 @@ def test_recording_has_25_frames_per_second_with_first_and_last(recorder, env, f
     assert mujoco_state(env)[1].time == pytest.approx(0.3, abs=0.03)
 
 
+def test_steps_longer_than_a_frame_are_recorded_in_real_time(flexing, monkeypatch):
+    monkeypatch.setattr(mujoco, "Renderer", Blind)
+    env = make_env(ELBOW, action_repeat=6)
+    (frames,) = EpisodeRecorder(env, size=(16, 20), seconds=1.0).record(flexing, 1)
+    seconds = mujoco_state(env)[1].time
+    step = 6 * env._env.unwrapped.dt
+    assert step > 2 / 25 and len(frames) / 25 > seconds - step
+
+
 def test_recorded_episodes_are_those_of_the_evaluation(recorder, env, flexing):
     before = torch.get_rng_state()
     recorder.record(flexing, 2)

@@ -149,7 +149,7 @@ class EpisodeRecorder:
         state, over = self._env.reset(), False
         start, frames = self._data.time, [self.draw()]
         while not over and (passed := self._data.time - start) < self._seconds:
-            if passed + 1e-9 >= len(frames) / FPS:
+            while passed + 1e-9 >= len(frames) / FPS:  # a long step spans several frames
                 frames.append(self.draw())
             after = self._env.step(policy(state))
             over = bool(after["next", "done"].any())
