@@ -21,12 +21,12 @@ from tests.configs import ROOT, tiny
 from torchrl_etl.analysis.viewer import Session
 from torchrl_etl.analysis.viewer.muscles import driven_muscles
 from torchrl_etl.analysis.viewer.page import Page, check_port
-from torchrl_etl.envs import SimulationError, actuator_names
+from torchrl_etl.envs import SimulationError, actuator_names, make_env
 from torchrl_etl.experiment import Experiment
 from torchrl_etl.inspection import open_bundle, open_run, open_zoo
 from torchrl_etl.modules import SARDecoder, SynergyDecoder
 from torchrl_etl.synergies import BundleError, save_bundle
-from torchrl_etl.zoo import ZooError, read_card
+from torchrl_etl.zoo import ZooError, read_card, synergies
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +111,18 @@ def test_sliders_move_only_the_synergies_of_a_bundle_with_a_residual(decoder, tm
         session.step()
         assert session.subject.drivers == ["sliders"] and session.steps == 1
         assert len(driven_muscles(session.subject.decoder, muscles)) == 2
+
+
+def test_opening_a_bundle_leaves_no_simulator_open(monkeypatch):
+    made = []
+
+    def build(*name, **options):
+        made.append(make_env(*name, **options))
+        return made[-1]
+
+    monkeypatch.setattr("torchrl_etl.inspection.make_env", build)
+    open_bundle(synergies("overactuated"))
+    assert [env.is_closed for env in made] == [True]
 
 
 def test_zoo_entry_repeats_the_first_return_on_its_card():

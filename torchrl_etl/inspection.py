@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,7 +87,8 @@ def open_bundle(bundle: Path, env: str | None = None, *, goal: Goal | None = Non
                 "env=TASK, a task of the same body."
             ) from error
     task = resolve_task(env, goal)
-    spec = EnvironmentSpec.of(make_env(env, goal=goal))
+    with closing(make_env(env, goal=goal)) as simulator:
+        spec = EnvironmentSpec.of(simulator)
     check_compatible(info, spec.actuators, spec.low, spec.high)
     return Subject(
         str(bundle),
