@@ -44,7 +44,8 @@ def main() -> None:
         series = folder.series(f"learn/{arguments.series}")
         for frames, mean in stretches(*series, arguments.stretch):
             row |= {"frames": frames, arguments.series: round(mean, 1)}
-            append(arguments.out, row | {key: start[key] for key in ("commit", "machine")})
+            with exit_on_error(ValueError):
+                append(arguments.out, row | {key: start[key] for key in ("commit", "machine")})
 
 
 def stretches(frames: list[int], returns: list[float], length: int) -> list[tuple[int, float]]:

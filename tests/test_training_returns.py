@@ -26,3 +26,7 @@ def test_returns_are_averaged_over_complete_stretches(tmp_path: Path):
         ["task", "sac", "3", "10", "2.0", "c", "m"],
         ["task", "sac", "3", "20", "5.0", "c", "m"],  # no complete stretch after it
     ]
+    (log.parent / "loss.csv").write_text("10,3.0\n")
+    before = out.read_text()
+    assert script(study, str(run), "--stretch", "10", "--out", str(out), "--series", "loss") == 2
+    assert out.read_text() == before, "its header names another series"
