@@ -43,6 +43,10 @@ def main() -> None:
         task, *others = dict.fromkeys(experiment.context.config.env for experiment in opened)
         if others:
             raise ValueError(f"the runs are of {task} and {others[0]}; pass runs of one task.")
+        captions = [caption(experiment) for experiment in opened]
+        for name in captions:
+            if captions.count(name) > 1:
+                raise ValueError(f"several runs are of {name}; pass one of each method and seed.")
         sides = {caption(experiment): episode(experiment) for experiment in opened}
         path = arguments.folder / f"{task}.webp"
         write_atomically(path, animated_picture(side_by_side(sides)))
