@@ -30,8 +30,8 @@ def main(arguments: Sequence[str]) -> None:
         repetitions = _count("repetitions", settings["repetitions"])
         if not settings["results"]:
             raise ValueError("no results are given; pass results=FOLDER, which has results.csv.")
-        sweep = read_sweep(settings["results"])
-        folder = Path(settings["out"] or settings["results"])
+        results = Path(settings["results"]).expanduser()
+        sweep, folder = read_sweep(results), Path(settings["out"] or results).expanduser()
         tasks, methods = write_report(
             sweep,
             folder,
