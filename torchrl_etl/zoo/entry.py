@@ -37,6 +37,9 @@ __all__ = [
     "untrained",
 ]
 
+# Of a card with values of other types or sizes.
+_FAULTS = (AttributeError, KeyError, RuntimeError, TypeError, ValueError)
+
 ENTRIES = Path(__file__).parent / "entries"
 """The folder of the entries that come with torchrl_etl."""
 
@@ -268,7 +271,7 @@ def _policy(folder: Path, card: Card) -> TensorDictModuleBase:
         check_imported(decoder.get("kind"), f"The decoder of {folder}", ZooError, remedy)
     try:
         policy, state = make_policy(**card.policy), safetensors.torch.load(content)
-    except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+    except (*_FAULTS, SafetensorError) as error:
         raise ZooError(
             f"{CARD} in {folder} describes no policy ({error}); copy it again."
         ) from error
