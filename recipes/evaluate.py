@@ -27,7 +27,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_etl import zoo
 from torchrl_etl.analysis.animation import write_animation
-from torchrl_etl.checks import check_flag, check_integer, check_real
+from torchrl_etl.checks import check_flag, check_integer, check_path, check_real
 from torchrl_etl.command_line import (
     OPENING_ERRORS,
     check_overrides,
@@ -55,6 +55,7 @@ CONF = Path(__file__).parent / "conf"
 def main(config: DictConfig) -> None:
     quiet_torchrl()
     with exit_on_error(*OPENING_ERRORS):
+        check_path(run=config.run, zoo=config.zoo)
         check_integer(1, episodes=config.episodes)
         check_flag(video=config.video, video_before=config.video_before)
         check_real("(0, inf)", video_seconds=config.video_seconds)

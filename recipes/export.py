@@ -17,7 +17,7 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from torchrl_etl.checks import check_choice, check_integer
+from torchrl_etl.checks import check_choice, check_integer, check_path
 from torchrl_etl.command_line import (
     OPENING_ERRORS,
     check_overrides,
@@ -41,6 +41,7 @@ def main(config: DictConfig) -> None:
     with exit_on_error(*OPENING_ERRORS):
         if config.run is None:
             raise ValueError("no run is given; pass run=PATH, the folder that etl_sac.py printed.")
+        check_path(run=config.run, out=config.out)
         check_choice("part", config.part, ("all", "synergies"))
         check_integer(1, episodes=config.episodes)
         if "/" in str(config.name) or str(config.name) in (".", ".."):

@@ -31,7 +31,14 @@ from torchrl_etl.analysis import (
     vaf_curve,
     variance_accounted_for,
 )
-from torchrl_etl.checks import check_choice, check_flag, check_integer, check_real, check_sizes
+from torchrl_etl.checks import (
+    check_choice,
+    check_flag,
+    check_integer,
+    check_path,
+    check_real,
+    check_sizes,
+)
 from torchrl_etl.command_line import check_overrides, exit_on_error, quote_paths
 from torchrl_etl.io import write_atomically
 from torchrl_etl.modules.recorded_actions import LEAST_REACH, OVERSHOOT
@@ -99,6 +106,7 @@ def kind_and_options(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """Checks all settings; returns the kind of synergies and keyword arguments of its model."""
     if config.data is None:
         raise ValueError("no recording is given; pass data=FILE, a .csv, .npy or .npz file.")
+    check_path(data=config.data, out=config.out)
     if not isinstance(config.leave_out, ListConfig):
         raise ValueError(
             f"leave_out is {config.leave_out!r}; it must be a list of columns, such as [time]."

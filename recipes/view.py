@@ -18,6 +18,7 @@ import hydra
 from omegaconf import DictConfig
 
 from torchrl_etl.analysis.viewer import Session, Subject
+from torchrl_etl.checks import check_path
 from torchrl_etl.command_line import (
     OPENING_ERRORS,
     check_overrides,
@@ -52,6 +53,7 @@ def main(config: DictConfig) -> None:
 
 def open_subject(config: DictConfig) -> Subject:
     """The run, entry or bundle in the settings; exactly one must be given."""
+    check_path(**{source: config[source] for source in SOURCES})
     named = [source for source in SOURCES if config[source] is not None]
     if len(named) != 1:
         raise ValueError(

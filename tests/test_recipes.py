@@ -173,6 +173,7 @@ def test_both_stages_run_on_a_gymnasium_id_and_with_paper_settings(options, tmp_
         ("evaluate.py", "run=no (where)", "holds no run"),
         ("etl_sac.py", "resume=[]", "resume is []; pass folders of runs"),
         ("evaluate.py", "episodes=3", "no run is given; pass run=PATH"),
+        ("evaluate.py", "run=[a,b]", "run is ['a', 'b']; it must be one path"),
         ("evaluate.py", "episode=3", "did you mean episodes"),
     ],
 )

@@ -263,6 +263,7 @@ def test_synergies_of_another_recording_or_a_run_are_not_overwritten(tmp_path, m
         (["leave_out=m0"], "leave_out is 'm0'; it must be a list"),
         (["data=null"], "no recording is given"),
         (["data=other.csv"], "no file"),
+        (["data=[a.csv,b.csv]"], "data is ['a.csv', 'b.csv']; it must be one path"),
         (["normalise=true"], "did you mean normalize"),
         (["knd=nmf"], "did you mean kind"),
         (["out=emg.csv"], "emg.csv is a file, so out=emg.csv cannot be a folder"),

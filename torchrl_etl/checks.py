@@ -19,6 +19,7 @@ __all__ = [
     "check_choice",
     "check_flag",
     "check_integer",
+    "check_path",
     "check_real",
     "check_sizes",
     "check_width",
@@ -66,6 +67,21 @@ def check_integer(least: int, **values: object) -> None:
     for name, value in values.items():
         if not _is_integer(value) or value < least:
             raise ValueError(f"{name} is {value!r}; it must be a whole number, {least} or more.")
+
+
+def check_path(**values: object) -> None:
+    """Raise a ``ValueError`` naming the first value that is neither a path nor ``None``.
+
+    Examples:
+        >>> check_path(run="runs/a", out=None)
+        >>> check_path(run=["runs/a", "runs/b"])
+        Traceback (most recent call last):
+        ...
+        ValueError: run is ['runs/a', 'runs/b']; it must be one path.
+    """
+    for name, value in values.items():
+        if value is not None and not isinstance(value, str):
+            raise ValueError(f"{name} is {value!r}; it must be one path.")
 
 
 def check_real(interval: str, **values: object) -> None:
