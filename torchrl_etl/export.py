@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,8 @@ def export_run(
     learner, context = stage.learner, experiment.context
     described = describe_policy(experiment, learner)
     policy = rebuilt(learner.policy, described)
-    result = evaluate_task(policy, context.make_env(), context.task, episodes=episodes)
+    with closing(context.make_env()) as env:
+        result = evaluate_task(policy, env, context.task, episodes=episodes)
     start = (experiment.folder.versions or [{}])[-1]
     start.pop("saved", None)
     card = Card(
