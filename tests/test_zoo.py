@@ -311,6 +311,15 @@ def test_export_into_a_folder_that_is_no_entry_is_refused(run, tmp_path):
     assert (tmp_path / "thesis.tex").exists()
 
 
+def test_run_of_a_gpu_is_exported_without_one(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    config = OmegaConf.load(run / "config.yaml")
+    OmegaConf.save(OmegaConf.merge(config, {"device": "cuda:7"}), tmp_path / "run" / "config.yaml")
+    card = export_run(tmp_path / "run", tmp_path / "toy", composed, CONF, episodes=1)
+    assert "device=cuda:7" in card.training["command"]
+    assert zoo.load(tmp_path / "toy")
+
+
 def test_export_and_evaluate_commands(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert command("export.py", f"run={run}", "name=toy", "episodes=2") == 0

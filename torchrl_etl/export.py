@@ -64,7 +64,9 @@ def export_run(
         ValueError: if there is no run, it is from a release with other setting names, or an entry
             cannot hold its policy.
     """
-    experiment = Experiment(resumed_config(run, defaults=compose([])), resume=run)
+    trained = resumed_config(run, defaults=compose([]))
+    device, trained.device = trained.device, "cpu"  # where the entry is evaluated
+    experiment = Experiment(trained, resume=run)
     stage = experiment.learned()
     learner, context = stage.learner, experiment.context
     described = describe_policy(experiment, learner)
@@ -73,6 +75,7 @@ def export_run(
         result = evaluate_task(policy, env, context.task, episodes=episodes)
     start = (experiment.folder.versions or [{}])[-1]
     start.pop("saved", None)
+    experiment.config.device = device  # for the command
     card = Card(
         task={**context.task, "goal": experiment.task.goal},
         actuators=list(context.spec.actuators),
