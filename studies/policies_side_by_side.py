@@ -47,7 +47,7 @@ def main() -> None:
         for name in captions:
             if captions.count(name) > 1:
                 raise ValueError(f"several runs are of {name}; pass one of each method and seed.")
-        sides = {caption(experiment): episode(experiment) for experiment in opened}
+        sides = dict(zip(captions, map(episode, opened), strict=True))
         path = arguments.folder / f"{task}.webp"
         write_atomically(path, animated_picture(side_by_side(sides)))
     print(path)

@@ -98,8 +98,8 @@ def test_report_from_end_to_end(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["results={}", "control=sca"], 2, "control=sca has no finished run; did you mean sac?"),
-        (["results={}", "control=zzz"], 2, "there are sac."),
+        (["results={}", "control=sca"], 2, "control is 'sca'; choose one of"),
+        (["results={}", "control=zzz"], 2, "choose one of sac."),
         (["results={}", "frames=-5"], 2, "frames is '-5'; it must be a whole number, 1 or more"),
         (["results={}", "frames=60000"], 2, "no finished run has an evaluation; the longest run"),
         (["results={}/nowhere"], 2, "There is no folder"),

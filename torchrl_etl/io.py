@@ -5,6 +5,7 @@ A crash during a replacement leaves either the old files or the new ones.
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
@@ -109,7 +110,7 @@ def replace_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     parent.mkdir(parents=True, exist_ok=True)
     if aside.exists() and not folder.exists():  # an earlier crash between the two moves below
         os.replace(aside, folder)
-    for stale in parent.glob(f".{folder.name}.saving-*"):
+    for stale in parent.glob(f".{glob.escape(folder.name)}.saving-*"):
         shutil.rmtree(stale, ignore_errors=True)
     fresh = folder.with_name(f".{folder.name}.saving-{os.getpid()}")
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import shlex
@@ -25,6 +24,7 @@ from torchrl_etl.analysis.sweep_statistics import (
     normalize,
     overall,
 )
+from torchrl_etl.checks import check_choice
 from torchrl_etl.io import write_atomically
 
 __all__ = ["write_report"]
@@ -99,10 +99,7 @@ def _methods(sweep: SweepResults, control: str) -> list[str]:
     if not sweep.finished:
         raise ValueError(f"None of the {len(sweep.runs)} runs finished: nothing to report.")
     methods = sorted({run.method for run in sweep.finished})
-    if control not in methods:
-        near = difflib.get_close_matches(control, methods, n=3)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(methods)}."
-        raise ValueError(f"control={control} has no finished run; {hint}")
+    check_choice("control", control, methods)
     return [control, *(method for method in methods if method != control)]
 
 

@@ -89,7 +89,7 @@ class Run:
         other = {*begun} ^ {*asked}
         for row in rows:
             if _key(row) == self.key and (known := row.get("settings")):
-                other |= {*shlex.split(known)} ^ {*self.other_settings}
+                other |= {*shlex.split(known)} ^ {*self.settings(*SET_BY_KEY)}
         if other:
             raise ValueError(
                 f"{self.path} was started with other settings ({', '.join(sorted(other))}); pass "
@@ -116,15 +116,9 @@ class Run:
 
         return OmegaConf.load(self.path / "config.yaml").evaluation.episodes
 
-    @property
-    def settings(self) -> tuple[str, ...]:
-        """Settings in its command, without the seed."""
-        return tuple(each for each in self.command[1:] if not each.startswith("seed="))
-
-    @property
-    def other_settings(self) -> tuple[str, ...]:
-        """Settings in its command that no column of its rows' key holds."""
-        return tuple(each for each in self.command[1:] if not each.startswith(SET_BY_KEY))
+    def settings(self, *without: str) -> tuple[str, ...]:
+        """Settings in its command that do not begin with one of ``without``."""
+        return tuple(each for each in self.command[1:] if not each.startswith(without))
 
     @property
     def stem(self) -> str:
@@ -142,7 +136,8 @@ class Run:
         if folder is None or not (starts := folder.versions):
             return
         own: dict[str, Any] = {"task": self.task, "goal": self.goal, "method": self.method}
-        own |= {"seed": self.seed, "status": status, "settings": shlex.join(self.other_settings)}
+        own |= {"seed": self.seed, "status": status}
+        own["settings"] = shlex.join(self.settings(*SET_BY_KEY))
         before = sum(sum(folder.series(f"{s}/wall_seconds")[1][-1:]) for s in EARLIER_STAGES)
         own["episodes"] = self.episodes
         series = {
@@ -175,7 +170,7 @@ def start(runs: Sequence[Run], environ: Mapping[str, str]) -> None:
         where, settings = resume_setting([run.path for run in runs]), []
     elif others:
         where = f"run_dir={first.stem}${{seed}}"
-        settings = [*first.settings, f"seeds=[{','.join(str(run.seed) for run in runs)}]"]
+        settings = [*first.settings("seed="), f"seeds=[{','.join(str(run.seed) for run in runs)}]"]
     else:
         where = f"run_dir={first.path}"
     for run in runs:
@@ -278,7 +273,7 @@ class Sweep:
         shared: dict[tuple[Any, ...], list[Run]] = {}
         for run in runs:
             alone = run.starts or not self.seeds_at_once or run.stem == str(run.path)
-            what = run.stem, run.settings, run.frames, run.has_begun
+            what = run.stem, run.settings("seed="), run.frames, run.has_begun
             shared.setdefault((*what, run.seed if alone else None), []).append(run)
         return list(shared.values())
 
@@ -310,10 +305,10 @@ class Sweep:
         """
         rows: list[dict[str, Any]] = []
         for run in self.runs:
-            own = list(run.rows(self.status(run)))
+            found = list(run.rows(self.status(run)))
             # Rows of a run that finished elsewhere stay until this folder's run is as long.
-            if own and own[-1]["frames"] >= self._done.get(run.key, 0):
-                rows += own
+            if found and found[-1]["frames"] >= self._done.get(run.key, 0):
+                rows += found
         mine = {_key(row) for row in rows}
         known = mine | {_key(row) for row in self._earlier}
         for run in self.runs:

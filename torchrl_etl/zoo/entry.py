@@ -129,7 +129,8 @@ def load(
         >>> env.rollout(2, policy)["next", "reward"].shape
         torch.Size([2, 1])
     """
-    folder, card = find(name), read_card(name)
+    folder = find(name)
+    card = read_card(folder)
     policy = _policy(folder, card).to(device or "cpu")
     if env is None:
         env = _make_env(folder, card, device)
@@ -159,7 +160,8 @@ def untrained(
         >>> zoo.untrained("overactuated").in_keys
         ['observation']
     """
-    folder, card = find(name), read_card(name)
+    folder = find(name)
+    card = read_card(folder)
     trained = _policy(folder, card)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
