@@ -10,7 +10,6 @@ All settings with their defaults:
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from torchrl_etl.command_line import (
     quote_paths,
 )
 from torchrl_etl.inspection import open_bundle, open_run, open_zoo
+from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.zoo import bundle_path
 
 CONF = Path(__file__).parent / "conf"
@@ -43,12 +43,9 @@ def main(config: DictConfig) -> None:
         session = Session(open_subject(config))
         page = Page(session, host=config.host, port=config.port, say=print)
     print(f"{session.subject.name} is shown at {page.address} (Ctrl-C to stop)", flush=True)
-    for number in (signal.SIGINT, signal.SIGTERM):  # also in the background, where & ignores them
-        signal.signal(number, signal.default_int_handler)
-    try:
-        page.run()
-    except KeyboardInterrupt:
-        print("The viewer has stopped.")
+    with StopOnSignal() as stop:  # an exception could be lost in one of the libraries' callbacks
+        page.run(until=lambda: stop.requested)
+    print("The viewer has stopped.")
 
 
 def open_subject(config: DictConfig) -> Subject:

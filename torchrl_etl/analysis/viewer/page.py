@@ -107,7 +107,7 @@ class Page:
         self.server.on_client_disconnect(lambda client: self._commands.put(self._browser_left))
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Serve until ``until()`` is true, or an interrupt."""
+        """Serve until ``until()`` is true, or an exception such as an interrupt."""
         last = time.monotonic()
         try:
             while not until():
