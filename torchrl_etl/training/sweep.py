@@ -295,6 +295,7 @@ class Sweep:
                 process.wait(120)
             except subprocess.TimeoutExpired:
                 process.kill()
+                process.wait()
         self.write()
         self._lock.release()
 
