@@ -24,9 +24,9 @@ settings="learn.replay_ratio=0.125 learn.learning_starts=5000 learn.buffer_size=
   explore.frames=20000 explore.replay_ratio=0.25
   evaluation.every=25000 evaluation.episodes=5 checkpoint.every=50000 log_every=5000"
 
-queue() {
+queue() { # method, more settings
   $python recipes/sweep.py "tasks=[$task]" "methods=[$1]" "seeds=${SEEDS:-[0,1]}" frames="$frames" \
-    out=$out jobs="${JOBS:-1}" settings="$(echo $settings)"
+    out=$out jobs="${JOBS:-1}" settings="$(echo $settings $2)"
 }
 
 control() { # of etl_body: its name, and what makes its synergies
@@ -37,7 +37,8 @@ control() { # of etl_body: its name, and what makes its synergies
 }
 
 queue sac
-queue etl
+queue etl learn.prefill=true
+queue etl_no_reuse
 queue etl_body
 control shuffled --shuffle 0
 control still --still

@@ -204,6 +204,14 @@ def test_method_file_holds_the_fixed_settings_of_its_method(method):
         assert OmegaConf.select(made, key) == value
 
 
+@pytest.mark.parametrize(("ratio", "prefill"), [(1, True), (4, True), (0.5, False)])
+def test_prefill_is_the_default_at_one_update_per_frame_or_more(ratio, prefill):
+    config = Experiment(tiny(f"learn.replay_ratio={ratio}", "run_dir=unused")).config
+    assert config.learn.prefill is prefill
+    given = tiny(f"learn.replay_ratio={ratio}", f"learn.prefill={not prefill}", "run_dir=unused")
+    assert Experiment(given).config.learn.prefill is not prefill
+
+
 def test_config_without_synergies_has_no_exploration_or_prefill():
     config = Experiment(tiny("method=sac", "learn.prefill=true", "run_dir=unused")).config
     assert (config.exploration.kind, config.synergies.kind, config.learn.prefill) == (

@@ -294,7 +294,7 @@ def test_misspelled_kind_of_synergies_is_refused_with_the_nearest():
 @pytest.mark.parametrize("now", sorted(set(RENAMED.values())))
 def test_every_new_name_of_a_renamed_setting_exists(now):
     key = now.partition("=")[0]
-    configs = tiny(), tiny("exploration=metra")
+    configs = tiny("learn.prefill=true"), tiny("exploration=metra")  # null by default
     assert any(OmegaConf.select(config, key) is not None for config in configs)
 
 

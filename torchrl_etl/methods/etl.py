@@ -32,7 +32,7 @@ from torchrl_etl.synergies import (
 from torchrl_etl.training.context import Context
 from torchrl_etl.training.loop import StopOnSignal
 from torchrl_etl.training.run_folder import facts
-from torchrl_etl.training.stage import Stage
+from torchrl_etl.training.stage import Stage, check_budget
 from torchrl_etl.training.work import Work
 from torchrl_etl.user_code import import_user_module
 
@@ -91,7 +91,11 @@ class ETL(Method):
         if self.given:
             self._settle_given()
         self._settle_num_synergies()
-        self.prefills = config.learn.prefill
+        if (learn := config.learn).prefill is None:
+            with naming("learn"):
+                check_budget(learn.frames, learn.replay_ratio)
+            learn.prefill = learn.replay_ratio >= 1  # below, it only did harm (log, 116 and 118)
+        self.prefills = learn.prefill
 
     def _settle_given(self) -> None:
         """Check the given synergies; compute the body's, if asked for and not saved already."""

@@ -121,8 +121,9 @@ def validate(config: DictConfig) -> None:
                 f"{name} is {config[name]!r}; it must map names to values, such as "
                 f"{name}={{NAME: VALUE}}."
             )
-    if config.compile not in (None, True, False):
-        raise ValueError(f"compile is {config.compile!r}; it must be true, false or null.")
+    for name, value in {"compile": config.compile, "learn.prefill": config.learn.prefill}.items():
+        if value not in (None, True, False):
+            raise ValueError(f"{name} is {value!r}; it must be true, false or null.")
     key = config.success_key
     if key is not None and (not isinstance(key, str) or not key):
         raise ValueError(f"success_key is {key!r}; it must name an entry of info, or be null.")
@@ -154,7 +155,7 @@ def _check_values(config: DictConfig) -> None:
     def of(*keys: str) -> dict[str, Any]:
         return {key: OmegaConf.select(config, key) for key in keys}
 
-    check_flag(**of("progress", "pictures", "learn.prefill", "collector.ahead"))
+    check_flag(**of("progress", "pictures", "collector.ahead"))
     for optional in ("frames", "threads", "num_synergies"):
         if config[optional] is not None:
             check_integer(1, **of(optional))
