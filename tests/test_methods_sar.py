@@ -121,6 +121,14 @@ def test_sar_refuses_invalid_play_options(option, message, tmp_path):
         Experiment(rival("sar", tmp_path / "run", f"method.options.{option}"))
 
 
+def test_sar_plans_with_the_simulators_of_all_workers(tmp_path):
+    workers = "collector.num_workers=2", "collector.num_envs=4", "collector.kind=process"
+    with pytest.raises(ValueError, match="8 simulators need 800 for two whole episodes"):
+        Experiment(rival("sar", tmp_path / "run", *workers, "frames=2000"))
+    frames = "frames=2000", "method.options.rollout_frames=800"
+    assert Experiment(rival("sar", tmp_path / "run", *workers, *frames)).method.rollout_frames
+
+
 @pytest.mark.parametrize(("steps", "needed"), [(50, 200), (200, 800)])
 def test_sar_plans_with_the_configured_length_of_an_episode(steps, needed, tmp_path):
     def sar(rollout_frames):

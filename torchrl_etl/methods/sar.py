@@ -78,7 +78,10 @@ class SAR(Method):
                 )
         self.played = resolve_task(played["name"], played["goal"]).env_id
         steps, simulators = longest_episode(played, unlimited=0), config.collector.num_envs
-        if self.rollout_frames < (needed := steps * max(2, simulators)):
+        if config.collector.kind != "single":  # which has no workers
+            simulators *= config.collector.num_workers
+        needed = steps * max(2, simulators)
+        if self.rollout_frames < needed and not self.file.is_file():
             raise ValueError(
                 f"method.options.rollout_frames is {self.rollout_frames}, but {simulators} "
                 f"simulators need {needed} for two whole episodes of {steps} steps, and SAR takes "
