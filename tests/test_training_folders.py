@@ -54,6 +54,13 @@ def copy(finished, tmp_path) -> Path:
 # Checkpoints ---------------------------------------------------------------------------------
 
 
+def test_resume_of_a_finished_run_leaves_no_files_of_its_buffer(tmp_path):
+    run = tmp_path / "run"
+    Experiment(tiny(f"run_dir='{run}'", "method=sac", "learn.buffer_storage=memmap")).run()
+    resume(run)
+    assert not list((run / "buffer").rglob("*.memmap"))
+
+
 def test_resume_with_damaged_checkpoints_is_refused_and_keeps_rows(copy):
     before = rows(copy)
     for checkpoint in (copy / "checkpoints" / "learn").iterdir():

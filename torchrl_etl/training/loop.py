@@ -108,6 +108,7 @@ def run_stage(
     # A fresh start also drops the row of frame 0 from a run that was killed before saving.
     folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
     if stage.finished:
+        stage.close()  # loading has put the buffer into files, if it is kept there
         return None
 
     bar = _progress_bar(stage, show_progress)
