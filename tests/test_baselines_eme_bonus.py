@@ -216,6 +216,7 @@ def test_wrong_networks_and_options_are_refused() -> None:
     for options, message in (
         ({"max_scale": 0.5}, "max_scale is 0.5"),
         ({"weight": -1.0}, "weight is -1.0"),
+        ({"normalize": "no"}, "normalize is 'no'; it must be true or false"),
         ({"in_keys": "observation"}, "pass a pair of keys, the observation and the action"),
         ({"out_keys": ("bonus",)}, "pass a pair of keys, the bonus and the total reward"),
     ):

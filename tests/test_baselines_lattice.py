@@ -162,6 +162,7 @@ def test_actions_fill_the_bounds_and_stay_inside(kind: dict[str, bool], body: st
         ({"alpha": -1.0}, "alpha is -1.0; it must be a number 0 or more"),
         ({"std_reg": -1.0}, "std_reg is -1.0; it must be a number 0 or more"),
         ({"body": "conv"}, "choose one of mlp, residual"),
+        ({"state_dependent": "no"}, "state_dependent is 'no'; it must be true or false"),
     ],
 )
 def test_bad_input_is_refused_at_construction(options: dict[str, Any], message: str) -> None:

@@ -246,6 +246,7 @@ def test_bootstrapped_distances_stay_bounded(divergence: str) -> None:
         ({"gamma": 1.0}, "gamma is 1.0"),
         ({"weight": -1.0}, "weight is -1.0"),
         ({"epsilon": -1.0}, "epsilon is -1.0"),
+        ({"delay_encoder": "no"}, "delay_encoder is 'no'; it must be true or false"),
     ],
 )
 def test_wrong_options_are_refused_at_construction(options: dict[str, Any], message: str) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_etl import functional
 from torchrl_etl.baselines.reward_ensemble import diversity_scale
-from torchrl_etl.checks import check_real
+from torchrl_etl.checks import check_flag, check_real
 from torchrl_etl.modules.running_deviation import RunningDeviation
 from torchrl_etl.transforms.keys import check_network
 from torchrl_etl.transforms.transition_reward import TransitionReward, evaluate
@@ -62,7 +62,8 @@ class EMEBonus(TransitionReward):
     Raises:
         TypeError: if a network has no in- and out-keys.
         ValueError: if a network has too many or too few of them, ``in_keys`` or ``out_keys`` is
-            not a pair, ``max_scale`` is below 1 or ``weight`` is negative.
+            not a pair, ``max_scale`` is below 1, ``weight`` is negative, or ``normalize`` is
+            neither true nor false.
         KeyError: if an input is in neither the tensordict nor the specs of the env.
 
     Examples:
@@ -110,6 +111,7 @@ class EMEBonus(TransitionReward):
                 raise ValueError(f"{name} is {keys!r}; pass a pair of keys, {content}.")
         check_real("[1, inf)", max_scale=max_scale)
         check_real("[0, inf)", weight=weight)
+        check_flag(normalize=normalize)
         super().__init__(in_keys=list(in_keys), out_keys=list(out_keys))
         # Not submodules: they would follow the env's device, be put in eval mode while the learner
         # uses them, and be saved twice.

@@ -13,7 +13,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from torchrl_etl.checks import check_real
+from torchrl_etl.checks import check_flag, check_real
 from torchrl_etl.draws import standard_normal
 from torchrl_etl.modules.actor_critic import Body, actor_with, make_layers
 from torchrl_etl.modules.clamp import Clamp
@@ -257,9 +257,9 @@ def make_lattice_actor(
         ``out_key`` [*, n] within the bounds.
 
     Raises:
-        ValueError: if there is no hidden layer, the bounds of log σ are not an ordered pair that
-            contains ``log_std_init``, the action's are not finite and in order, or alpha or std_reg
-            is negative.
+        ValueError: if ``state_dependent`` is neither true nor false, there is no hidden layer, the
+            bounds of log σ are not an ordered pair that contains ``log_std_init``, the action's are
+            not finite and in order, or alpha or std_reg is negative.
 
     Examples:
         >>> import torch
@@ -270,6 +270,7 @@ def make_lattice_actor(
         >>> written["scale_tril"].shape, bool((written["action"] >= 0).all())
         (torch.Size([3, 5, 5]), True)
     """
+    check_flag(state_dependent=state_dependent)
     if log_std_bounds is None:
         log_std_bounds = _STATE_DEPENDENT_BOUNDS if state_dependent else _PLAIN_BOUNDS
     if isinstance(log_std_bounds, (str, float, int)) or len(log_std_bounds) != 2:

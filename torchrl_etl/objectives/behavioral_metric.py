@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_etl import functional
-from torchrl_etl.checks import check_choice, check_real
+from torchrl_etl.checks import check_choice, check_flag, check_real
 from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import (
     embedded_ends,
@@ -162,6 +162,7 @@ class BehavioralMetricLoss(LossModule):
         check_choice("regularizer", regularizer, ("hinge", "literal", "none"))
         check_choice("pairs", pairs, ("permuted", "all"))
         check_choice("reduction", reduction, ("mean", "sum", "none"))
+        check_flag(delay_encoder=delay_encoder)
         check_parts("encoder", encoder, TensorDictModuleBase, outputs=1)
         _check_divergence(divergence, distance, dynamics)
         check_real("[0, 1)", gamma=gamma)  # for distances to be finite
