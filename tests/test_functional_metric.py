@@ -63,6 +63,8 @@ def test_l2_is_a_metric() -> None:
         ([3.0, 0.0], [3.0, 0.0], 9.0),
         ([1.0, 0.0], [-1.0, 0.0], 1 + 0.1 * math.pi),
         ([1.0, 1.0], [2.0, 0.0], 3 + 0.1 * math.pi / 4),
+        ([0.0, 0.0], [2.0, 0.0], 2.0),
+        ([0.0, 0.0], [0.0, 0.0], 0.0),
     ],
 )
 def test_mico_by_hand(x: list[float], y: list[float], expected: float) -> None:

@@ -115,6 +115,12 @@ def test_ended_episodes_share_one_absorbing_state(ended: list[bool], divergence:
     assert out["loss_metric"].item() == pytest.approx(expected, rel=1e-4)
 
 
+def test_ended_episodes_have_distance_zero_in_micos_metric_too() -> None:
+    loss = BehavioralMetricLoss(table(*ROWS), distance="mico", gamma=0.5, regularizer="none")
+    out = loss(transitions([0, 1], [1, 2], [0.0, 0.0], [True, True], 3))
+    assert out["loss_metric"].item() == pytest.approx(0.5 * out["mean_distance"].item() ** 2)
+
+
 def test_hinge_and_literal_by_hand() -> None:
     data = transitions([0, 1], [1, 2], [0.0, 0.0], [False, False], 3)
     options = {"epsilon": 0.1, "weight": 0.5}

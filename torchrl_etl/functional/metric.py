@@ -80,7 +80,7 @@ def mico_distance(x: Tensor, y: Tensor) -> Tensor:
 
     This is a *diffuse* metric: a state's distance to itself is :math:`\|x\|^2`, not zero. It suits
     a divergence estimated from independent samples, which is not zero for a state and itself
-    either.
+    either. The origin has no angle to others: there, only the norms count.
 
     Args:
         x, y (Tensor): embeddings, ``[*, k]``.
@@ -101,6 +101,7 @@ def mico_distance(x: Tensor, y: Tensor) -> Tensor:
     y_unit = y / (y_square + EPS).sqrt().unsqueeze(-1)
     # Half-angle form: accurate and with finite gradients at 0 and pi, where arccos is neither.
     angle = 2 * torch.atan2(l2_distance(x_unit, y_unit), l2_distance(x_unit, -y_unit))
+    angle = torch.where((x_square > 0) & (y_square > 0), angle, 0.0)
     return 0.5 * (x_square + y_square) + ANGLE_WEIGHT * angle
 
 

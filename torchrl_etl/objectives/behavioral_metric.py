@@ -64,8 +64,9 @@ class BehavioralMetricLoss(LossModule):
           means off, and distances diverged (to 4e5 where Eq. 4 says 1.7).
         - The paper does not treat termination. Here all terminated next states are one absorbing
           state, embedded at the origin. Two ended episodes have distance zero; a state's distance
-          from the end is the norm of its embedding. (For MICo's diffuse metric the origin is
-          exact: a state without any further reward has norm zero.) Truncation bootstraps as usual.
+          from the end is the norm of its embedding. (For MICo's diffuse metric it is half the
+          square of the norm, and the origin is exact: a state without any further reward has norm
+          zero.) Truncation bootstraps as usual.
 
     Args:
         encoder (TensorDictModule): the state encoder; its first out key is the embedding [*, k].
