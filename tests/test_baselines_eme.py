@@ -325,3 +325,21 @@ def test_plain_networks_are_refused() -> None:
 def test_batch_of_one_transition_is_refused() -> None:
     with pytest.raises(ValueError, match="at least two"):
         loss_of_tables()(transitions([0], [1], [0.0], [False], 3))
+
+
+@pytest.mark.parametrize("key", ["reward", "terminated"])
+def test_missing_or_misshapen_entries_are_named(key: str) -> None:
+    actor = make_actor({"observation": OBSERVATION_DIM}, Bounded(-1, 1, shape=(ACTION_DIM,)))
+    ensemble = RewardEnsemble(OBSERVATION_DIM, ACTION_DIM, 2)
+    loss = EMELoss(StateEncoder(OBSERVATION_DIM, 2), ensemble, actor)
+    entries = {"observation": torch.rand(8, OBSERVATION_DIM), "action": torch.rand(8, ACTION_DIM)}
+    data = TensorDict({**entries, "next": {"observation": entries["observation"]}}, [8])
+    data["next", "reward"] = torch.rand(8, 1)
+    data["next", "terminated"] = torch.zeros(8, 1, dtype=torch.bool)
+    loss(data)
+    with pytest.raises(KeyError, match=rf"EMELoss reads \('next', '{key}'\), which the data lacks"):
+        loss(data.exclude(("next", key)))
+    for shape in ([8], [8, 2]):
+        wrong = data.clone().set(("next", key), data["next", key].new_zeros(shape))
+        with pytest.raises(ValueError, match=rf"'{key}'\) has shape .* must be \[\*, 1\]"):
+            loss(wrong)
