@@ -252,6 +252,35 @@ def test_options_that_a_method_does_not_have_are_refused(method, message, tmp_pa
 
 
 @pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("dep", {}, "method.options lacks dep_frames, which kind=dep needs"),
+        ("eme", {"lr": 1e-3, "tau": 0.01}, "method.options lacks embedding_dim, hidden, ensemble"),
+        ("sar", {"play_task": None}, "method.options lacks frames, rollout_frames"),
+        ("dynsyn", {"frames": 200}, "method.options lacks amplitude, group_share"),
+        (
+            "dynsyn",
+            {"frames": 200, "amplitude": 1.0, "group_share": 0.5, "start_share": 0.5},
+            "method.options.start_share needs ceiling",
+        ),
+    ],
+)
+def test_missing_options_are_named(kind, options, message, tmp_path):
+    config = tiny(f"run_dir='{tmp_path}/run'", "method=sac")
+    config.method = {"name": "mine", "kind": kind, "options": options}
+    with pytest.raises(ValueError, match=message):
+        Experiment(config)
+
+
+def test_lattice_has_defaults_for_all_its_options(tmp_path):
+    config = tiny(f"run_dir='{tmp_path}/run'", "method=sac", "learn.noise.kind=independent")
+    config.method = {"name": "mine", "kind": "lattice"}
+    assert Experiment(config).method.options == {}
+    config.method = {**config.method, "options": {"state_dependent": True}}
+    assert Experiment(config).method.stage().learner.behavior.freq == 8
+
+
+@pytest.mark.parametrize(
     ("setting", "message"),
     [
         ("lattice +method.options.alpha=-1", "method.options.alpha is -1"),

@@ -28,6 +28,7 @@ class DEP(Method):
         *("dep_frames", "probability", "intervention_length", "policy_every", "kappa", "tau"),
         *("bias_rate", "time_distance", "s4avg", "normalize"),
     )
+    needs = ("dep_frames",)
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")

@@ -33,6 +33,7 @@ class DynSyn(Method):
 
     fixed_settings = (("learn.noise.kind", "independent", "the actor has its own noise"),)
     takes = ("frames", "amplitude", "group_share", "start_share", "start", "slope", "ceiling")
+    needs = ("frames", "amplitude", "group_share")
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -47,6 +48,8 @@ class DynSyn(Method):
             check_real("(0, 1]", group_share=self.share)
             if "start_share" in deviation:
                 check_real("[0, 1)", start_share=deviation["start_share"])
+                if "ceiling" not in deviation or {"start", "slope"} & {*deviation}:
+                    raise ValueError("start_share needs ceiling, and replaces start and slope.")
 
     def prepare(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         yield from ()  # a generator, see Work; this one never pauses

@@ -27,6 +27,7 @@ class EME(Method):
 
     fixed_settings = (("learn.n_steps", 1, "bonus and metric are of single steps"),)
     takes = ("embedding_dim", "hidden", "ensemble", "lr", "tau", "weight", "normalize", "max_scale")
+    needs = takes
 
     def stage(self) -> Stage:
         spec, options = self.context.spec, self.options

@@ -39,9 +39,9 @@ class Lattice(Method):
 
     def behavior(self, actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
         """The behavior policy; state-dependent noise holds its matrices for ``freq`` steps."""
-        if not self.options["state_dependent"]:
+        if not self.options.get("state_dependent", False):
             return actor
-        return LatticeNoise(actor, freq=self.options["freq"])
+        return LatticeNoise(actor, **{k: v for k, v in self.options.items() if k == "freq"})
 
     def stage(self) -> Stage:
         self.context.seed_everything("learn")

@@ -31,15 +31,18 @@ class Method(ABC):
         charged_frames (int): frames that :meth:`prepare` plans to use, which divide the budget.
         has_synergies (bool): whether ``stage`` and ``synergies`` may be set.
         takes (tuple of str): names of the method's own options.
+        needs (tuple of str): those of them that have no default.
         fixed_settings (tuple): settings with only one valid value, each as (key, value, reason).
 
     Raises:
-        ValueError: for an unknown or invalid option, and for settings that the method ignores.
+        ValueError: for an unknown, missing or invalid option, and for settings that the method
+            ignores.
     """
 
     charged_frames: int = 0
     has_synergies: ClassVar[bool] = False
     takes: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[tuple[str, ...]] = ()
     fixed_settings: ClassVar[tuple[tuple[str, Any, str], ...]] = ()
     options: Mapping[str, Any]
 
@@ -54,6 +57,11 @@ class Method(ABC):
                     f"({', '.join(self.takes) or 'it has none'}); settings of the learner, such as "
                     "the discount, are under learn (learn.sac.gamma)."
                 )
+        if missing := [name for name in self.needs if name not in self.options]:
+            raise ValueError(
+                f"method.options lacks {', '.join(missing)}, which kind={config.method.kind} "
+                "needs; add what is missing, as in the files of recipes/conf/method."
+            )
         if not self.has_synergies and (config.stage != "all" or config.synergies.bundle):
             raise ValueError(
                 f"method={config.method.name} has one stage and no synergies; leave stage and "

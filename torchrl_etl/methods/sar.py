@@ -53,6 +53,7 @@ class SAR(Method):
         *("play_task", "frames", "rollout_frames", "preview_episodes", "percentile"),
         *("num_synergies", "blend"),
     )
+    needs = takes
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
