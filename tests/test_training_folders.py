@@ -54,6 +54,21 @@ def copy(finished, tmp_path) -> Path:
 # Checkpoints ---------------------------------------------------------------------------------
 
 
+def test_tensorboard_hides_points_of_a_run_killed_before_its_first_checkpoint(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    run = tmp_path / "run"
+    experiment = Experiment(tiny(f"run_dir='{run}'", "method=sac", "log=[tensorboard]"))
+    experiment.folder.open(resume=False)
+    experiment.folder.log({"learn/return": 1.0}, 250)
+    experiment.folder._loggers[1].experiment.close()
+    experiment.folder.close()
+    resume(run)
+    events = accumulator.EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    frames, _ = experiment.folder.series("learn/return")
+    assert [point.step for point in events.Scalars("learn/return")] == frames
+
+
 def test_resume_of_a_finished_run_leaves_no_files_of_its_buffer(tmp_path):
     run = tmp_path / "run"
     Experiment(tiny(f"run_dir='{run}'", "method=sac", "learn.buffer_storage=memmap")).run()

@@ -105,8 +105,8 @@ def run_stage(
     resumed = checkpoints.load_newest_whole(stage.checkpoint())
     if not resumed:
         _refuse_lost_checkpoints(stage, folder)
-    # A fresh start also drops the row of frame 0 from a run that was killed before saving.
-    folder.forget_after(stage.name, offset + stage.frames if resumed else -1)
+    # A run that was killed before saving has logged rows, too.
+    folder.forget_after(stage.name, offset + stage.frames, from_start=not resumed)
     if stage.finished:
         stage.close()  # loading has put the buffer into files, if it is kept there
         return None

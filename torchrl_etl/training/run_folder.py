@@ -138,13 +138,16 @@ class RunFolder:
     def scalars(self) -> Path:
         return self.path / "csv" / "scalars"
 
-    def forget_after(self, stage: str, frame: int) -> None:
-        """Drop rows of ``stage`` after ``frame``, which a resumed run logs again."""
+    def forget_after(self, stage: str, frame: int, *, from_start: bool = False) -> None:
+        """Drop rows of ``stage`` after ``frame``, which a resumed run logs again.
+
+        If the stage starts over (``from_start``), all its rows are dropped. TensorBoard still shows
+        that of ``frame``, where the stage before may have logged too.
+        """
         for path in sorted((self.scalars / stage).rglob("*.csv")):
-            rows = (f"{at},{value}\n" for at, value in _read(path) if at <= frame)
-            write_atomically(path, "".join(rows))
-        if frame >= 0:
-            self._purge_step = frame + 1
+            kept = [row for row in _read(path) if row[0] <= frame and not from_start]
+            write_atomically(path, "".join(f"{at},{value}\n" for at, value in kept))
+        self._purge_step = frame + 1
 
     def log(self, values: Mapping[str, float], frame: int) -> None:
         """Log scalars at a frame count that includes earlier stages."""
