@@ -54,6 +54,24 @@ def copy(finished, tmp_path) -> Path:
 # Checkpoints ---------------------------------------------------------------------------------
 
 
+def test_every_simulator_of_a_run_is_closed(tmp_path, monkeypatch):
+    count = {"open": 0}
+    build, close = AnalyticOveractuated.__init__, AnalyticOveractuated.close
+
+    def counted_build(env, *arguments, **options):
+        count["open"] += 1
+        build(env, *arguments, **options)
+
+    def counted_close(env):
+        count["open"] -= 1
+        close(env)
+
+    monkeypatch.setattr(AnalyticOveractuated, "__init__", counted_build)
+    monkeypatch.setattr(AnalyticOveractuated, "close", counted_close)
+    Experiment(tiny(f"run_dir='{tmp_path}/run'", "method=sac")).run()
+    assert count["open"] == 0
+
+
 def test_tensorboard_hides_points_of_a_run_killed_before_its_first_checkpoint(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     run = tmp_path / "run"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import Checkpoint
+from torchrl.envs import EnvBase
 
 from torchrl_etl.checks import naming
 from torchrl_etl.collectors import start_resource_tracker
@@ -129,12 +130,15 @@ class Experiment:
         any."""
         return self.method.stage().learner.policy
 
-    def evaluator(self, stage: Stage) -> Callable[[], Evaluation]:
-        """A function that evaluates the stage's current policy on the evaluation seeds."""
+    def evaluator(self, stage: Stage, env: EnvBase | None = None) -> Callable[[], Evaluation]:
+        """A function that evaluates the stage's current policy on the evaluation seeds.
+
+        It uses ``env``, or one simulator of its own, which is left open.
+        """
         return partial(
             evaluate_task,
             stage.learner.policy,
-            self.context.make_env(),
+            self.context.make_env() if env is None else env,
             self.context.task,
             episodes=self.config.evaluation.episodes,
         )
@@ -142,15 +146,16 @@ class Experiment:
     def _learn(self, stop: StopOnSignal) -> Work[dict[str, Any]]:
         stage, charged = self.method.stage(), self.method.frames_before()
         self.method.begin(stage)
-        evaluator = self.evaluator(stage)
-        last = yield from self.context.run_stage(
-            stage,
-            stop,
-            evaluate=evaluator,
-            evaluate_every=self.config.evaluation.every,
-            offset=charged,
-        )
-        after = last or evaluator()
+        with closing(self.context.make_env()) as env:
+            evaluator = self.evaluator(stage, env)
+            last = yield from self.context.run_stage(
+                stage,
+                stop,
+                evaluate=evaluator,
+                evaluate_every=self.config.evaluation.every,
+                offset=charged,
+            )
+            after = last or evaluator()
         if self.config.pictures:
             self._draw_curves(charged)
         summary: dict[str, Any] = {"frames": stage.frames, "frames_charged": charged + stage.frames}
