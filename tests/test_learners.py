@@ -72,7 +72,8 @@ def test_strides_of_gradients_and_loaded_moments_do_not_matter():
 def test_loading_keeps_the_learning_rate_tensor_of_a_cuda_graph():
     rate = torch.tensor(0.5)
     optimizer = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=rate, capturable=True)
-    of_a_cpu = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.25, fused=True)
+    of_a_cpu = GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=0.5, fused=True)
+    of_a_cpu.scale_rates(0.5)
     optimizer.load_state_dict(of_a_cpu.state_dict())
     (group,) = optimizer.param_groups
     assert group["lr"] is rate and rate == 0.25 and group["capturable"]
@@ -85,6 +86,15 @@ def test_state_dict_round_trip_keeps_scaled_rates():
     saved.scale_rates(0.5)
     loaded.load_state_dict(saved.state_dict())
     assert loaded.rates == [group["lr"] for group in loaded.param_groups] == [0.1]
+
+
+def test_learning_rate_changed_on_resume_is_in_effect_from_the_first_update():
+    saved, loaded = (
+        GradientAdam([torch.nn.Parameter(torch.ones(2))], lr=lr, fused=True) for lr in (0.2, 0.4)
+    )
+    saved.scale_rates(0.5)
+    loaded.load_state_dict(saved.state_dict())
+    assert loaded.rates == [group["lr"] for group in loaded.param_groups] == [0.2]
 
 
 def test_ema_after_warm_up_equals_pytorchs_and_copies_buffers():

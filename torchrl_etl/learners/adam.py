@@ -81,9 +81,11 @@ class GradientAdam(Adam):
         super().load_state_dict(state_dict)
         for group, before in zip(self.param_groups, own, strict=True):
             loaded = float(group["lr"])
-            self.factor = loaded / group.get("initial_lr", loaded)
+            initial = group.get("initial_lr", loaded)
+            self.factor = loaded / initial
             group |= before
-            _set_rate(group, loaded)
+            same = initial == group["initial_lr"]  # then free of the rounding of the factor
+            _set_rate(group, loaded if same else self.factor * group["initial_lr"])
         for parameter, state in self.state.items():
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment] = _laid_out(state[moment], parameter)
