@@ -108,6 +108,13 @@ def test_critics_learn_the_target_and_the_actor_the_smaller_mean():
     assert abs(out.item() + means.amin(0).mean().item()) < 1e-3
 
 
+def test_support_of_whole_numbers_is_that_of_the_same_floats():
+    whole = SUPPORT.long()
+    assert (whole == SUPPORT).all()
+    loss = make_loss(support=whole)
+    assert torch.equal(loss.support, SUPPORT) and loss(batch())["loss_qvalue"].isfinite()
+
+
 @pytest.mark.parametrize("support", [torch.zeros(3), torch.tensor([0.0, 1.0, 3.0]), torch.eye(2)])
 def test_uneven_or_unordered_support_is_refused(support):
     with pytest.raises(ValueError, match="evenly spaced, ascending"):

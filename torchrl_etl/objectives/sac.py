@@ -129,6 +129,8 @@ class LeanSACLoss(SACLoss):
                 )
         super().__init__(actor_network, qvalue_network, loss_function=loss_function, **kwargs)
         if support is not None:
+            if not support.is_floating_point():  # of torch.arange(-5, 6)
+                support = support.float()
             _check_support(support)
             support = support.detach().to(self.alpha_init.device, copy=True)
         self.register_buffer("support", support)
