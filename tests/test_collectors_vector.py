@@ -204,6 +204,14 @@ def test_init_random_frames_are_collected_first():
     assert second["action"].min() > 0.9
 
 
+def test_episodes_end_without_trajectory_numbers():
+    make, policy = parts("overactuated", "policy")
+    collector = VectorCollector(make, policy, frames_per_batch=96, track_traj_ids=False)
+    batch = next(iter(collector))
+    assert batch["next", "done"].any()
+    assert "collector" not in batch
+
+
 @pytest.mark.parametrize(
     "name, value",
     [

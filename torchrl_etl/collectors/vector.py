@@ -184,9 +184,10 @@ class VectorCollector(Collector):
             fresh[key] = np.zeros_like(now[key])
         for transform in self._transforms:
             transform.array_reset(now, fresh, done)
-        key = ("collector", "traj_ids")
-        fresh[key] = now[key].copy()
-        fresh[key][done] = self._traj_pool.get_traj_and_increment(int(done.sum())).numpy()
+        if self.track_traj_ids:
+            key = ("collector", "traj_ids")
+            fresh[key] = now[key].copy()
+            fresh[key][done] = self._traj_pool.get_traj_and_increment(int(done.sum())).numpy()
         return fresh
 
 
