@@ -9,12 +9,14 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, ListStorage, ReplayBuffer
+from torchrl.data import Bounded, ListStorage, ReplayBuffer, Unbounded
 from torchrl.envs import (
     ExplorationType,
+    GymWrapper,
     RewardSum,
     StepCounter,
     TransformedEnv,
+    default_info_dict_reader,
     set_exploration_type,
 )
 
@@ -242,6 +244,12 @@ def test_unsupported_environments_are_refused():
         VectorCollector(lambda: make().append_transform(StepCounter()), policy, frames_per_batch=12)
     with pytest.raises(ValueError, match="num_envs=2 or more"):
         VectorCollector(lambda: make_env("overactuated"), policy, frames_per_batch=12)
+    simulators = vectorized_point()._env
+    with pytest.raises(ValueError, match="skips frame_skip and readers of info"):
+        VectorCollector(GymWrapper(simulators, frame_skip=2), frames_per_batch=12)
+    reader = default_info_dict_reader(["age"], spec=[Unbounded((3,))])
+    with pytest.raises(ValueError, match="skips frame_skip and readers of info"):
+        VectorCollector(GymWrapper(simulators).set_info_dict_reader(reader), frames_per_batch=12)
 
 
 @pytest.mark.parametrize("kind", [VectorCollector, Collector])

@@ -210,6 +210,12 @@ def _take_apart(env: EnvBase) -> tuple[SyncVectorEnv, list[ArrayTransform]]:
             "InitTracker and transforms that have array_step and array_reset, but the environment "
             f"has a {what}; use torchrl.collectors.Collector for it."
         )
+    if env.wrapper_frame_skip != 1 or env.info_dict_reader:
+        raise ValueError(
+            "VectorCollector steps simulators directly, which skips frame_skip and readers of info "
+            f"of the {type(env).__name__}; use make_env(..., action_repeat=...), or "
+            "torchrl.collectors.Collector."
+        )
     return env._env, found
 
 
