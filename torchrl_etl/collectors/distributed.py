@@ -47,7 +47,8 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         launcher (str): ``"mp"`` starts processes on this machine; ``"submitit"`` submits Slurm
             jobs, described by ``slurm_kwargs``. Defaults to ``"mp"``.
         tcp_port (int, optional): rendezvous port. Defaults to a free port.
-        **kwargs: see :class:`~torchrl.collectors.distributed.DistributedCollector`.
+        **kwargs: see :class:`~torchrl.collectors.distributed.DistributedCollector`, except
+            for those that store or split batches or push weights.
 
     Raises:
         ImportError: if a launcher is not installed.
@@ -83,7 +84,7 @@ class DistributedWorkers(RemoteWorkers, DistributedCollector):
         collector_kwargs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout)
+        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout, kwargs)
         collector_kwargs = worker_options(collector_class, collector_kwargs)
         _check_launcher(launcher)
         share = frames_per_batch // num_workers if sync else frames_per_batch

@@ -49,7 +49,8 @@ class RayWorkers(RemoteWorkers, RayCollector):
         remote_configs (mapping, optional): resources and placement of a worker, as in
             ``ray.remote``. Defaults to ``{"num_cpus": 1}``; a worker gets as many OpenMP threads
             as CPUs.
-        **kwargs: see :class:`~torchrl.collectors.distributed.RayCollector`.
+        **kwargs: see :class:`~torchrl.collectors.distributed.RayCollector`, except
+            for those that store or split batches or push weights.
 
     Raises:
         ImportError: if Ray is not installed.
@@ -88,7 +89,7 @@ class RayWorkers(RemoteWorkers, RayCollector):
         remote_configs: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout)
+        check_arguments(create_env_fn, policy, num_workers, frames_per_batch, sync, timeout, kwargs)
         collector_kwargs = worker_options(collector_class, collector_kwargs)
         check_integer(0, replacements=replacements)
         remote_configs = {"num_cpus": 1, **(remote_configs or {})}

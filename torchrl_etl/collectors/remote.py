@@ -30,6 +30,15 @@ __all__ = [
 
 MANAGED = {"create_env_fn", "policy", "policy_factory", "frames_per_batch", "total_frames"}
 MANAGED |= {"split_trajs", "replay_buffer", "weight_updater", "weight_sync_schemes"}
+# Arguments that only the loop of TorchRL's own collectors reads. Splitting would also mix up the
+# workers' trajectories, since each counts its own.
+_NOT_TAKEN = (
+    "split_trajs",
+    "replay_buffer",
+    "update_after_each_batch",
+    "max_weight_update_interval",
+    "update_interval",
+)
 
 
 class RemoteWorkers:
@@ -65,6 +74,7 @@ class RemoteWorkers:
         collector_class (type): class of the workers' collectors. Defaults to
             :class:`~torchrl.collectors.Collector`.
         collector_kwargs (mapping, optional): further arguments of ``collector_class``.
+        postproc (callable, optional): applied to each batch, in this process.
 
     Raises:
         TypeError, ValueError: for bad arguments, before workers are started.
@@ -72,6 +82,7 @@ class RemoteWorkers:
     """
 
     policy: TensorDictModuleBase
+    postproc: Callable[[TensorDictBase], TensorDictBase] | None
     num_workers: int
     timeout: float
 
@@ -109,7 +120,7 @@ class RemoteWorkers:
                 worker, batch = self._receive()
                 self._request(worker)
             self.collected_frames += batch.numel()
-            yield batch
+            yield batch if self.postproc is None else self.postproc(batch)
 
     def _with_origin(self, batch: TensorDictBase, worker: int) -> TensorDictBase:
         """The batch with its origin. Call it before the worker's next request."""
@@ -223,6 +234,7 @@ def check_arguments(
     frames_per_batch: int,
     sync: bool,
     timeout: float,
+    others: Mapping[str, Any],
 ) -> None:
     """Raise ValueError or TypeError with the value, what is expected, and a fix."""
     if not callable(create_env_fn) or isinstance(create_env_fn, EnvBase):
@@ -243,6 +255,12 @@ def check_arguments(
             f"{num_workers * max(1, round(frames_per_batch / num_workers))}."
         )
     check_real("(0, inf)", timeout=timeout)
+    unused = [name for name in _NOT_TAKEN if others.get(name) not in (None, False, -1)]
+    if unused:
+        raise ValueError(
+            f"The workers take no {unused[0]}; leave it out, push weights with "
+            "update_policy_weights_(), and store or split the batches that you get."
+        )
 
 
 def worker_options(
