@@ -265,6 +265,16 @@ def test_failed_start_raises_in_await_start_and_can_be_closed():
     Batches(fails_to_start).close()
 
 
+def test_a_timeout_within_the_collector_is_reported_at_once():
+    def waits():
+        raise TimeoutError("no licence server")
+
+    batches = Batches(waits, timeout=120.0)
+    with pytest.raises(CollectionError, match=r"did not start: no licence server Continue from"):
+        batches.await_start()
+    batches.close()
+
+
 def test_single_cannot_run_ahead():
     with pytest.raises(ValueError, match="needs another process"):
         Batches(partial(VectorCollector, make_overactuated), in_process=True, ahead=True)

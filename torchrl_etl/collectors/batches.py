@@ -167,23 +167,21 @@ class Batches:
         while time.monotonic() < deadline:
             try:
                 return future.result(min(1.0, self._timeout))
-            except TimeoutError:
-                # TorchRL 0.14.1 detects a dead worker while it waits for a batch, but not while
-                # it waits for a reply.
-                for index, process in enumerate(getattr(self._collector, "procs", ())):
-                    if process.exitcode is not None:
-                        self._is_stuck = True
-                        raise CollectionError(
-                            f"The collector's workers did not {what}: worker {index} ended (exit "
-                            f"code {process.exitcode}). {go_on}"
-                        ) from None
-            except RuntimeError as error:
-                if self._caller is None:
-                    raise
-                advice = "" if "resume=" in str(error) else go_on
-                raise CollectionError(
-                    f"The collector's workers did not {what}: {error} {advice}".strip()
-                ) from error
+            except (RuntimeError, TimeoutError) as error:
+                if future.done() and future.exception() is error:
+                    advice = "" if "resume=" in str(error) else go_on
+                    raise CollectionError(
+                        f"The collector's workers did not {what}: {error} {advice}".strip()
+                    ) from error
+            # TorchRL 0.14.1 detects a dead worker while it waits for a batch, but not while it
+            # waits for a reply.
+            for index, process in enumerate(getattr(self._collector, "procs", ())):
+                if process.exitcode is not None:
+                    self._is_stuck = True
+                    raise CollectionError(
+                        f"The collector's workers did not {what}: worker {index} ended (exit code "
+                        f"{process.exitcode}). {go_on}"
+                    )
         self._is_stuck = True
         raise CollectionError(
             f"The collector's workers did not {what} within {self._timeout:g} s; look for a "
