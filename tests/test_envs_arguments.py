@@ -27,9 +27,23 @@ gym.register("torchrl_etl_test/Forgiving-v0", entry_point=Forgiving, max_episode
 FORGIVING = "torchrl_etl_test/Forgiving-v0"
 
 
+def make_stiff(factor=1.0):
+    return Forgiving(stiffness=factor)
+
+
+gym.register("torchrl_etl_test/Stiff-v0", entry_point=make_stiff, max_episode_steps=2)
+
+
 def test_arguments_in_the_signature_or_popped_from_kwargs_are_passed():
     env = make_env(FORGIVING, env_kwargs={"stiffness": 0.5, "recipe": "a"})
     assert env.reset()["observation"].item() == 0.5
+
+
+def test_arguments_of_a_function_as_entry_point_are_passed():
+    env = make_env("torchrl_etl_test/Stiff-v0", env_kwargs={"factor": 0.5})
+    assert env.reset()["observation"].item() == 0.5
+    with pytest.raises(ValueError, match="does not take"):
+        make_env("torchrl_etl_test/Stiff-v0", env_kwargs={"nonsense": 3.0})
 
 
 def test_arguments_of_gymnasium_are_accepted():

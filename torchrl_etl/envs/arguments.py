@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
 __all__ = ["argument_errors", "check_known"]
 
@@ -30,13 +31,18 @@ def argument_errors(name: str, env_kwargs: Mapping[str, Any]) -> Iterator[None]:
 def check_known(env: gym.Env, name: str, env_kwargs: Mapping[str, Any]) -> None:
     """Reject arguments that an environment's constructors accept and ignore.
 
-    MyoSuite's constructors accept unused ``**kwargs``. An argument is known if a constructor has
-    it as a parameter, or if its code names it (``kwargs.pop("model_recipe", None)``).
+    MyoSuite's constructors accept unused ``**kwargs``. An argument is known if a constructor, or
+    the function registered as entry point, has it as a parameter, or if its code names it
+    (``kwargs.pop("model_recipe", None)``).
 
     Raises:
         ValueError: naming the argument and the nearest known ones.
     """
-    constructors = [vars(base).get("__init__") for base in type(env.unwrapped).__mro__]
+    spec = env.unwrapped.spec
+    entry = None if spec is None else spec.entry_point
+    maker = load_env_creator(entry) if isinstance(entry, str) else entry
+    classes = type(env.unwrapped).__mro__
+    constructors = [maker, *(vars(base).get("__init__") for base in classes)]
     known, named = set(inspect.signature(gym.make).parameters), set()
     for constructor in filter(inspect.isfunction, constructors):
         known |= inspect.signature(constructor).parameters.keys()
