@@ -145,6 +145,15 @@ def test_a_policy_function_is_the_policy_without_noise():
         policy_function(actor, action_key="synergy")
 
 
+def test_a_policy_function_follows_the_dtype_of_the_policy():
+    actor = make_actor({"observation": 6}, Bounded(-1, 1, shape=(16,)))
+    act, seen = policy_function(actor), np.zeros(6)
+    single = act(seen)
+    actor.double()
+    assert act(seen).dtype == single.dtype == np.float32
+    np.testing.assert_allclose(act(seen), single, atol=1e-6)
+
+
 def blocks() -> tuple[str, str, str]:
     """The page's code for a policy, for synergies, and for Stable-Baselines3."""
     policy, synergies, agent = BLOCK.findall(PAGE.read_text(encoding="utf-8"))

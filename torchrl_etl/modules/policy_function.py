@@ -50,13 +50,14 @@ def policy_function(
             f"The policy reads {list(policy.in_keys)} and writes {list(policy.out_keys)}; it must "
             f"read only {observation_key!r} and write {action_key!r}; otherwise pass other keys."
         )
-    device = next((tensor.device for tensor in policy.parameters()), None)
 
     @torch.no_grad()
     def act(observation: ArrayLike) -> np.ndarray:
-        seen = torch.as_tensor(np.asarray(observation), dtype=torch.float32, device=device)
+        weight = next(policy.parameters(), torch.empty(0))
+        seen = torch.as_tensor(np.asarray(observation)).to(weight)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             written = policy(TensorDict({observation_key: seen}, seen.shape[:-1]))
-        return written[action_key].cpu().numpy()
+        action = written[action_key]
+        return (action.float() if action.is_floating_point() else action).cpu().numpy()
 
     return act
