@@ -146,6 +146,12 @@ def test_decoding_without_residual_by_hand() -> None:
     torch.testing.assert_close(action, torch.tensor([[0.6, 0.1, -0.3], [0.1, 0.2, 0.3]]))
 
 
+def test_coefficients_of_any_dtype_are_decoded_in_that_of_the_basis() -> None:
+    decoder = SARDecoder(SYNERGIES, MUSCLES, blend=0.5)
+    synergy = torch.rand(2, SYNERGIES + MUSCLES, dtype=torch.float64)
+    assert torch.equal(decoder(synergy), decoder(synergy.float()))
+
+
 @pytest.mark.parametrize("blend", [1.0, 0.66])
 def test_actions_stay_in_the_bounds_and_reach_them(blend: float) -> None:
     basis = 5 * torch.randn(2, 3, generator=torch.Generator().manual_seed(0))

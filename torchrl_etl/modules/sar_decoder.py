@@ -34,6 +34,7 @@ class _BlendedBasis(nn.Module):
         self.register_buffer("high", high)
 
     def forward(self, synergy: Tensor) -> Tensor:
+        synergy = synergy.to(self.basis.dtype)
         if self.blend == 1:
             return (self.mean + synergy @ self.basis).clamp(self.low, self.high)
         synergy, raw = synergy.split(list(self.basis.shape), -1)
