@@ -57,6 +57,16 @@ def test_noise_is_independent_across_episodes(noise):
     assert begun == pytest.approx(0.0, abs=0.07) and going_on > 0.8
 
 
+@pytest.mark.parametrize("noise", [HeldNormal(16), PinkNormal(64)], ids=["held", "pink"])
+def test_noise_starts_anew_in_another_precision_or_on_another_device(noise):
+    going_on = torch.zeros(3, dtype=torch.bool)
+    for dtype in (torch.float64, torch.float32):
+        assert noise(torch.zeros(3, 2, dtype=dtype), going_on).dtype == dtype
+    noise(torch.zeros(3, 2, device="meta"), going_on.to("meta"))
+    many = torch.zeros(ROWS, 1)
+    assert kstest(noise(many, torch.zeros(ROWS, dtype=torch.bool))[:, 0], "norm").pvalue > 0.01
+
+
 def test_settings_that_cannot_be_used_are_refused():
     for make, words in (
         (lambda: PinkNormal(0), "longest is 0"),

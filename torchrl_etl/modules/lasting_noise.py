@@ -8,6 +8,7 @@ episode.
 from __future__ import annotations
 
 import math
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ class HeldNormal:
     def __call__(self, like: Tensor, is_init: Tensor) -> Tensor:
         """Noise [*, n] of this step in the dtype of ``like``; ``is_init`` [*] marks where an
         episode begins."""
-        if self._noise is None or self._noise.shape != like.shape:
+        if not _is_like(self._noise, like):
             self._noise = torch.zeros_like(like)
             self._left = torch.zeros_like(is_init, dtype=torch.long)
         lengths = 1 + torch.multinomial(self._chances, is_init.numel(), replacement=True)
@@ -86,8 +87,18 @@ class PinkNormal:
         """Noise of this step, see :class:`HeldNormal`."""
         kept = self._kept.to(like).view(-1, *[1] * like.ndim)
         drawn = torch.randn((len(kept), *like.shape), dtype=like.dtype, device=like.device)
-        if self._parts is None or self._parts.shape != drawn.shape:
-            self._parts = drawn
-        going_on = kept * self._parts + (1 - kept.square()).sqrt() * drawn
-        self._parts = torch.where(is_init.unsqueeze(-1), drawn, going_on)
+        if _is_like(self._parts, drawn):
+            going_on = kept * self._parts + (1 - kept.square()).sqrt() * drawn
+            drawn = torch.where(is_init.unsqueeze(-1), drawn, going_on)
+        self._parts = drawn
         return self._parts.sum(0) / math.sqrt(len(kept))
+
+
+def _is_like(kept: Tensor | None, now: Tensor) -> TypeGuard[Tensor]:
+    """Whether noise can go on: not where the simulators, the device or the precision are others."""
+    return (
+        kept is not None
+        and kept.shape == now.shape
+        and kept.dtype == now.dtype
+        and kept.device == now.device
+    )
