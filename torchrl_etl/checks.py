@@ -166,7 +166,8 @@ def naming(section: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise type(error)(f"{section}.{error}") from error
+        error.args = (f"{section}.{error}",)  # a new one may take other arguments, as JSON's does
+        raise
 
 
 @contextmanager
@@ -184,7 +185,9 @@ def renaming(**names: str) -> Iterator[None]:
         yield
     except ValueError as error:
         name, _, said = str(error).partition(" ")
-        raise type(error)(f"{names.get(name, name)} {said}") from error
+        if name in names:
+            error.args = (f"{names[name]} {said}",)
+        raise
 
 
 def check_flag(**values: object) -> None:
