@@ -67,11 +67,11 @@ def given_draws(tensors: Iterable[Tensor]) -> Iterator[None]:
         ...     standard_normal(torch.zeros(2))
         tensor([1., 1.])
     """
-    _source.given = list(tensors)
+    before, _source.given = _source.given, list(tensors)
     try:
         yield
     finally:
-        _source.given = None
+        _source.given = before
 
 
 def drawn_in(draws: TensorDictBase | None) -> AbstractContextManager[None]:
