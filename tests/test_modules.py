@@ -213,6 +213,13 @@ def test_state_encoder_is_invariant_to_the_scale_of_the_observation() -> None:
     assert encoder.module(torch.randn(5)).shape == (3,)
 
 
+def test_a_string_is_one_key() -> None:
+    encoder = StateEncoder(5, 3, in_keys="seen", out_keys="embedding")
+    dynamics = GaussianDynamics(3, in_keys="embedding", out_keys=("loc", "scale"))
+    data = dynamics(encoder(TensorDict({"seen": torch.randn(2, 5)}, [2])))
+    assert data["loc"].shape == data["scale"].shape == (2, 3)
+
+
 def test_state_encoder_refuses_impossible_sizes() -> None:
     with pytest.raises(ValueError, match="embedding_dim is 0"):
         StateEncoder(5, 0)

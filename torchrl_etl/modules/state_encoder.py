@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from torchrl_etl.checks import check_integer, check_sizes
+from torchrl_etl.modules.calls import as_keys
 
 __all__ = ["GaussianDynamics", "StateEncoder"]
 
@@ -72,7 +73,7 @@ class StateEncoder(TensorDictModule):
             nn.ReLU(),
             MLP(first, embedding_dim, num_cells=rest, activation_class=nn.ReLU),
         )
-        super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
+        super().__init__(network, in_keys=as_keys(in_keys), out_keys=as_keys(out_keys))
         self.embedding_dim = embedding_dim
 
 
@@ -123,5 +124,7 @@ class GaussianDynamics(TensorDictModule):
     ) -> None:
         check_integer(1, embedding_dim=embedding_dim)
         super().__init__(
-            _GaussianHead(embedding_dim, hidden), in_keys=list(in_keys), out_keys=list(out_keys)
+            _GaussianHead(embedding_dim, hidden),
+            in_keys=as_keys(in_keys),
+            out_keys=as_keys(out_keys),
         )

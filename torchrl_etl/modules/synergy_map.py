@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Bounded
 
+from torchrl_etl.modules.calls import as_keys
 from torchrl_etl.modules.gmvae import GMVAE
 
 __all__ = ["SynergyMap"]
@@ -50,9 +51,7 @@ class SynergyMap(TensorDictModule):
         in_keys: NestedKey | Sequence[NestedKey],
         out_keys: NestedKey | Sequence[NestedKey],
     ) -> None:
-        # TensorDictModule would take a tuple for one nested key.
-        keys = ([each] if isinstance(each, str) else [*each] for each in (in_keys, out_keys))
-        super().__init__(module, *keys)
+        super().__init__(module, as_keys(in_keys), as_keys(out_keys))
 
     def log_slope(self, synergy: Tensor) -> Tensor:
         """ln |det ∂a/∂r| [*] of the action a by the residual r, at ``synergy`` [*, d+n].
