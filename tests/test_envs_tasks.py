@@ -81,6 +81,15 @@ def test_unknown_task_suggests_the_nearest_name(wrong, right):
         resolve_task(wrong)
 
 
+def test_a_wrong_name_needs_no_simulator_to_be_corrected(monkeypatch):
+    for name in ("myosuite", "dm_control"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ValueError, match=r"Unknown task 'overactuatd'; .* overactuated[,.;]"):
+        resolve_task("overactuatd")
+    with pytest.raises(ImportError, match=r"torchrl_etl\[myosuite\]"):
+        resolve_task("somethingOfMyoSuite-v0")
+
+
 def test_other_suites_are_accepted_by_name():
     assert resolve_task("cheetah-run").suite == "dm_control"
     assert resolve_task("Pendulum-v1").episode_steps == 200

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -253,7 +254,11 @@ def _registered(name: str) -> bool:
                 "with gymnasium.register, under an id with a version, such as 'MyTask-v0'."
             )
     elif env_id not in gym.registry:
-        register_myosuite()
+        try:
+            register_myosuite()
+        except ImportError:  # rather a wrong name than a missing simulator?
+            if not difflib.get_close_matches(name, [*_BY_NAME, *gym.registry], cutoff=0.8):
+                raise
     return env_id in gym.registry
 
 
@@ -274,8 +279,9 @@ def _by_its_spec(name: str, goal: Goal | None) -> Task:
 
 
 def _nearest(name: str) -> list[str]:
-    suite_names = ("-".join(pair) for pair in dm_control_suite().ALL_TASKS)
-    known = [*_BY_NAME, *gym.registry, *suite_names]
+    known = [*_BY_NAME, *gym.registry]
+    with suppress(ImportError):
+        known += ("-".join(pair) for pair in dm_control_suite().ALL_TASKS)
     lowered = {candidate.lower(): candidate for candidate in reversed(known)}
     found = difflib.get_close_matches(name.lower(), lowered, n=5, cutoff=0.5)
     return [lowered[candidate] for candidate in found]
