@@ -6,7 +6,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
-from torchrl.envs import Compose, ParallelEnv, StepCounter, TensorDictPrimer, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    InitTracker,
+    ParallelEnv,
+    StepCounter,
+    TensorDictPrimer,
+    TransformedEnv,
+)
 
 from tests.point_env import PointEnv, TeamEnv
 from tests.transform_checks import TransformChecks
@@ -69,6 +76,13 @@ class TestDirectionPrimer(TransformChecks):
     def test_compose(self):
         data = Compose(self.transform(), DirectionPrimer(2, out_key="other"))(TensorDict())
         assert (data["direction"].shape, data["other"].shape) == ((K,), (2,))
+
+    def test_before_a_transform_whose_keys_depend_on_the_env(self):
+        env = TransformedEnv(PointEnv(), Compose(self.transform(), InitTracker()))
+        assert {"direction", "is_init"} <= set(env.rollout(2).keys())
+        env = TransformedEnv(PointEnv(), Compose(self.transform(), InitTracker("direction")))
+        with pytest.raises(ValueError, match="DirectionPrimer and InitTracker both write"):
+            env.reset()
 
     def test_model(self):
         network = TensorDictModule(nn.Linear(K, 2), in_keys=["direction"], out_keys=["out"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 
 import torch
 from tensordict import TensorDictBase
@@ -166,7 +167,9 @@ def _groups(spec: Composite, key: tuple[str, ...]) -> Iterator[Composite]:
 
 def _writes(transform: Transform) -> set[NestedKey]:
     own = transform.primers.keys(True, True) if isinstance(transform, TensorDictPrimer) else ()
-    return {unravel_key(key) for key in (*own, *(transform.out_keys or ()))}
+    with suppress(NotImplementedError):  # InitTracker's depend on an env that it is not in yet
+        own = (*own, *(transform.out_keys or ()))
+    return {unravel_key(key) for key in own}
 
 
 def _later(transform: Transform) -> Iterator[Transform]:
