@@ -36,6 +36,7 @@ STATEFUL = (
     "learn.sac.return_bound=5",
     "learn.sac.lr_end=0.5",
     "learn.sac.ema_decay=0.9",
+    "learn.prefill=true",
 )
 
 
