@@ -53,9 +53,8 @@ def table() -> Iterator[str]:
 
 def compared(folder: str, frames: int) -> list[Comparison]:
     """Comparisons of a folder's tasks with runs of SAC."""
-    sweep = read_sweep(RESULTS / folder)
-    of_task = ([r for r in sweep.finished if r.setting == setting] for setting in sweep.settings)
-    found = [compare(r, [*METHODS], CONTROL, frames=frames, repetitions=0) for r in of_task if r]
+    by_task = read_sweep(RESULTS / folder).finished_by_task
+    found = [compare(r, [*METHODS], CONTROL, frames=frames, repetitions=0) for r in by_task]
     return [each for each in found if each.result(CONTROL)]
 
 

@@ -58,10 +58,9 @@ def write_report(
         ValueError: for a control that was not run, or frames that no run reached.
     """
     methods = _methods(sweep, control)
-    by_task = [[r for r in sweep.finished if r.setting == setting] for setting in sweep.settings]
-    by_task = [runs for runs in by_task if runs]
     comparisons = [
-        compare(runs, methods, control, frames=frames, repetitions=repetitions) for runs in by_task
+        compare(runs, methods, control, frames=frames, repetitions=repetitions)
+        for runs in sweep.finished_by_task
     ]
     if not any(comparison.results for comparison in comparisons):  # before a report is replaced
         most = max(run.last_frames for run in sweep.finished)
@@ -71,7 +70,7 @@ def write_report(
         )
     folder.mkdir(parents=True, exist_ok=True)
     styles = looks(methods)
-    for runs, comparison in zip(by_task, comparisons, strict=True):
+    for runs, comparison in zip(sweep.finished_by_task, comparisons, strict=True):
         picture = folder / _picture(comparison.setting)
         task_picture(runs, styles, picture, budget=comparison.budget, repetitions=repetitions)
     scales = [normalize(comparison, control) for comparison in comparisons]

@@ -131,6 +131,14 @@ class SweepResults:
         return tuple(run for run in self.runs if run.finished)
 
     @property
+    def finished_by_task(self) -> tuple[tuple[SweepRun, ...], ...]:
+        """Finished runs of each pair of task and goal with any, in the order of ``settings``."""
+        by_task = (
+            tuple(run for run in self.finished if run.setting == each) for each in self.settings
+        )
+        return tuple(runs for runs in by_task if runs)
+
+    @property
     def unfinished(self) -> tuple[SweepRun, ...]:
         return tuple(run for run in self.runs if not run.finished)
 
