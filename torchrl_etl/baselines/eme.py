@@ -16,7 +16,7 @@ from torchrl_etl import functional
 from torchrl_etl.checks import check_choice, check_real
 from torchrl_etl.draws import standard_uniform
 from torchrl_etl.objectives.behavioral_metric import BehavioralMetricLoss
-from torchrl_etl.objectives.checks import check_parts, read
+from torchrl_etl.objectives.checks import check_parts
 from torchrl_etl.objectives.pairs import embedded_ends, outputs, partners, read_scalars
 
 __all__ = ["EMELoss"]
@@ -185,14 +185,13 @@ class EMELoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries listed under ``Keys``, for a batch of any size, which is not modified."""
-        following, key = tensordict["next"], self.tensor_keys.reward
-        reward = read(type(self).__name__, following, key, "next")
+        embedding, next_embedding = embedded_ends(self, tensordict)
+        key = self.tensor_keys.reward
+        reward = read_scalars(self, tensordict["next"], key, len(embedding))
         batch_size = reward.shape[:-1]
         reward = reward.detach().flatten()
         partner = partners(reward.numel(), reward.device).squeeze(1)
 
-        embedding, next_embedding = embedded_ends(self, tensordict)
-        read_scalars(self, following, key, len(embedding))  # raises if the shape is wrong
         predictions = outputs(self.ensemble, self.ensemble_params, tensordict)
         with torch.no_grad():
             loc, scale = self._gaussian(tensordict, like=embedding)

@@ -167,7 +167,7 @@ def _groups(spec: Composite, key: tuple[str, ...]) -> Iterator[Composite]:
 
 def _writes(transform: Transform) -> set[NestedKey]:
     own = transform.primers.keys(True, True) if isinstance(transform, TensorDictPrimer) else ()
-    with suppress(NotImplementedError):  # InitTracker's depend on an env that it is not in yet
+    with suppress(NotImplementedError):  # as TorchRL's InitTracker has none outside an env
         own = (*own, *(transform.out_keys or ()))
     return {unravel_key(key) for key in own}
 
